@@ -238,7 +238,7 @@ def compiled(linkage, state0, ts, forces, **options):
 print(json.dumps({
     "first": compiled(arm, start, np.linspace(0, 0.1, 101), forces),
     "times": [compiled(arm, start, np.linspace(0, 0.1, n), forces)
-              for n in (2, 3, 50, 500, 512)],
+              for n in (2, 3, 50, 500, 2048)],
     "durations": [compiled(arm, start, np.linspace(0, t1, 7), forces)
                   for t1 in (0.05, 0.2)],
     "gains": compiled(arm, start, np.linspace(0, 0.1, 5), (more,)),

@@ -36,7 +36,7 @@ _STANDS = 1e-9  # changes of a reference that are less are none [m or rad]
 
 
 class Response(Report):
-    """How joints followed the reference of their controller; prints itself.
+    """Measures of how joints followed the reference of their controller; prints itself.
 
     Measures of a step are those of the field: about the position at the last time, from
     which a load or friction may keep the reference away (`steady_error`). They are NaN

@@ -231,7 +231,7 @@ def switching(
 
 
 class Drive(NamedTuple):
-    """What drives the joints at a state.
+    """Causes of motion at a state.
 
     - `delta`, `qd`: displacements and velocities, prescribed ones as they are.
     - `tau`: efforts on the joints that are driven, less what prescribed ones take.

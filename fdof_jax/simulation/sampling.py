@@ -47,7 +47,7 @@ class ClockElement(Element):
 
 
 class Arrivals(ClockElement):
-    """When commands begin to act, if not at samples."""
+    """Times at which commands begin to act, if not at samples."""
 
 
 class Sampler(ClockElement):

@@ -28,7 +28,7 @@ from .prescribed import prescribed
 from .solution import Solution
 
 # All plain calls with at most this many output times share one program.
-_FEWEST_TIMES = 512
+_FEWEST_TIMES = 2048
 
 
 def solve(inputs: Inputs, keywords: Settings) -> tuple[Solution, bool | None]:

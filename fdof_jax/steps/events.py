@@ -1,4 +1,4 @@
-"""Where elements switch between the branches of their formulas, and what then jumps.
+"""Switches of elements between the branches of their formulas, and the jumps there.
 
 Within a step the branches are those in force at its start, so the step's equations are
 smooth. A step over the zero of a switching function is replaced by one that ends there.
@@ -95,7 +95,7 @@ class Regime(NamedTuple):
 
 
 class Events(eqx.Module):
-    """What happens between the steps of a run.
+    """Events between the steps of a run.
 
     Where efforts jump at a switch, a motion that starts on it, or meets it together
     with another, may have different derivatives on its two sides.

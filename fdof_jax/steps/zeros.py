@@ -137,7 +137,7 @@ def _turns(margins: _Margin) -> tuple[Array, Array]:
 
 
 class Passage(NamedTuple):
-    """Where switching functions pass 0 in a step, and which do at its end.
+    """Zeros of switching functions in a step, and those at its end.
 
     - `until`: the share of the step where a margin first passes 0, 1 if none does;
       `crossed`: whether any does.

@@ -94,7 +94,7 @@ class TuneResult(Report):
 
     @property
     def at_bound(self) -> Bool[np.ndarray, "2 joint"]:
-        """Whether a bound holds each gain."""
+        """True for each gain that a bound holds."""
         return self._box.at_bound(self.gains)
 
     @property
