@@ -102,7 +102,6 @@ def test_hard_cases():
 
 @pytest.mark.slow
 def test_recipes(tmp_path, monkeypatch):
-    (tmp_path / "docs").symlink_to(DOCS)
     monkeypatch.chdir(tmp_path)
     names = run(DOCS / "recipes.md")
     assert names["response"].settling_time[0] < 1.5
@@ -147,11 +146,8 @@ def test_recipes(tmp_path, monkeypatch):
     np.testing.assert_allclose(last[1], -1, atol=1e-8)
     shaken = names["shaken"].ys[0][-1] - fallen.q[-1]
     assert 1e-3 < np.abs(shaken).max() < 3
-    assert names["tuned"].tip_error < 0.02
     motor = names["motor"]
     start = fj.State([-1.5, 0], [0, 0])
     whole = fj.simulate(names["arm"], start, [0.0, 1.0, 2.0], (motor,))
     np.testing.assert_allclose(names["whole"].q[100::100], whole.q[1:], atol=1e-9)
     assert names["whole"].outcome == "successful" and names["whole"].ts[-1] == 2
-    assert names["parameters"].usable
-    np.testing.assert_allclose(names["parameters"].parameters["mass"], 1.4, rtol=2e-3)
