@@ -52,7 +52,7 @@ def resolve(event: Event, y: Integrated, args: Args) -> tuple[Integrated, Modes]
     energy_taken = jnp.zeros_like(event.t)
     if resets := resets_in(args.forces):
         for element, met in zip(resets, event.resets):
-            y, more = _after_reset(element, met, event, y, args)
+            y, more = _after_reset(element, met, event.t + event.late, y, args)
             energy_taken += more
     if PrescribedMotion in kinds:
         # Impulses move what friction and stops hold.
@@ -282,38 +282,23 @@ def _happenings(before: Modes, after: Modes, hit: Array, law: Laws) -> Array:
 
 
 def _after_reset(
-    element: Reset, met: Array, event: Event, y: Integrated, args: Args
+    element: Reset, met: Array, t: Array, y: Integrated, args: Args
 ) -> tuple[Integrated, Array]:
-    """Returns the state after a reset, if it is met, and the energy that it takes.
-
-    The step ended close to the zero of its condition: the state moves there and back.
-    """
-
-    arm, t = args.linkage, event.t + event.late
+    """Returns the state after a reset, if it is met, and the energy that it takes."""
+    arm = args.linkage
     name = f"forces[{place_of(element, args.forces)}]"
 
     def there(y):
-        rates = _rates(t, y, args)
-
-        def value(late):
-            delta, qd, *_ = _moved(y, late, rates)
-            q = args.q0 + jnp.stack(delta)
-            return element.when(t + late, q, jnp.stack(qd), arm)
-
-        none = jnp.zeros_like(t)
-        g, slope = jax.jvp(value, (none,), (jnp.ones_like(t),))
-        late = constant(jnp.where(slope != 0, -g / jnp.where(slope != 0, slope, 1), 0))
-        delta, qd, *own = _moved(y, late, rates)
+        delta, qd, *own = y
         before = args.q0 + jnp.stack(delta), jnp.stack(qd)
         with naming(name):
-            after = element.state_after(t + late, *before, arm)
+            after = element.state_after(t, *before, arm)
         q, qd = (without_fixed(arm, value) for value in after)
         masses = args.masses(t)
         energies = (sum(energy(arm, *state, masses)) for state in (before, (q, qd)))
-        new = tuple(q - args.q0), tuple(qd), *own
-        return _moved(new, -late, _rates(t, new, args)), jnp.subtract(*energies)
+        return (tuple(q - args.q0), tuple(qd), *own), jnp.subtract(*energies)
 
-    return jax.lax.cond(met, there, lambda y: (y, jnp.zeros_like(event.t)), y)
+    return jax.lax.cond(met, there, lambda y: (y, jnp.zeros_like(t)), y)
 
 
 def _recorded(events: Events, t: Array, kind: Array, first: int = 1) -> Events:

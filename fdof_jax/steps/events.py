@@ -20,7 +20,7 @@ from .dopri8 import SHORTEST, DenseOutput
 from .landing import Found, clearance
 from .switch_derivatives import Event, gained, gained_at_kink, lateness, moved
 from .term import Arguments, Integrated, Term
-from .zeros import CHECKED, CHECKS, SAMPLED, SHARES, passage
+from .zeros import CHECKED, CHECKS, OFFSET, ROUNDING, SAMPLED, SHARES, passage
 
 # A function whose zero is this close to the end of a step switches there: a share of
 # the step, as a power of the unit of rounding (1e-9 in float64).
@@ -28,8 +28,9 @@ _NEAR = 0.575
 # A function began on its zero if its values before were below this share of its size,
 # also a power of the unit of rounding.
 _ON_ZERO = 0.625
-# Of Newton's steps to the end of a run: right to rounding, with second derivatives.
-_NEWTON = 3
+# Of Newton's steps to a zero: right to rounding, with second derivatives.
+# The last of them is at most this share of all.
+_NEWTON, _CONVERGED = 3, 0.01
 # In steps of at most this many such distances, hidden zeros are not looked for.
 _BRIEF = 10
 
@@ -51,6 +52,9 @@ class Switches(NamedTuple):
     - `grazing`, `grazing_here`: how nearly the crossings so far grazed, and the one
       here; 0 if none (see `Passage`).
     - `modes`: those of the joints (see `ScheduledTerm`), None if elements hold none.
+    - `late`: 0, whose derivatives are those of the time of the event at the beginning
+      of this step; None without modes.
+    - `resets` (reset,): which resets are met here, None without any.
     - `ended`: which condition ended the run here, -1 if none did; None without any.
     """
 
@@ -66,13 +70,20 @@ class Switches(NamedTuple):
     grazing: Array
     grazing_here: Array
     modes: PyTree
+    late: Array | None
+    resets: Array | None
     ended: Array | None
 
     @property
     def facts(self) -> dict[str, Array]:
         """The statistics of a run that ended here."""
         sided = {} if self.one_sided is None else {"one_sided": self.one_sided}
-        slowest = {"slowest_crossing": 1 / self.grazing}
+        grazing = self.grazing
+        if self.ended is not None:
+            grazing = jnp.maximum(
+                grazing, jnp.where(self.ended < 0, 0, self.grazing_here)
+            )
+        slowest = {"slowest_crossing": 1 / grazing}
         return {"num_switches": self.passed} | sided | slowest
 
 
@@ -84,6 +95,7 @@ class Regime(NamedTuple):
       their zeros, as after a switch.
     - `sizes`: their largest values before, 0 of functions that are new.
     - `grazing`: how nearly crossings grazed, the one there included.
+    - `late`: see `Switches`.
     """
 
     sides: Array
@@ -92,6 +104,7 @@ class Regime(NamedTuple):
     on_zero: Array
     sizes: Array
     grazing: Array
+    late: Array | None
 
 
 class Events(eqx.Module):
@@ -134,6 +147,8 @@ class Events(eqx.Module):
             grazing=none,
             grazing_here=none,
             modes=modes,
+            late=none if self.guards else None,
+            resets=jnp.zeros(len(self.resets), bool) if self.resets else None,
             ended=jnp.array(-1) if self.ends else None,
         )
 
@@ -149,6 +164,7 @@ class Events(eqx.Module):
         """
         if_jumped = lambda after, before: jnp.where(jumped, after, before)
         sides, modes, sizes = if_jumped(last.after, last.sides), last.modes, last.sizes
+        late = None
         on_zero = sides != last.sides
         changed = on_zero & (last.sides != 0)
         if not self.guards:
@@ -156,10 +172,10 @@ class Events(eqx.Module):
         else:
             sides = sides.at[-self.guards :].set(1)
             at_start = jnp.any(modes.mode < 0)
-            y, modes, sides = jax.lax.cond(
+            y, modes, sides, late = jax.lax.cond(
                 jumped | at_start,
                 lambda: self._after_event(t, y, args, last, sides, changed, jumped),
-                lambda: (y, modes, sides),
+                lambda: (y, modes, sides, jnp.zeros_like(t)),
             )
             # Other modes have other guards.
             old = last.modes
@@ -168,40 +184,50 @@ class Events(eqx.Module):
             new = guards & (changed[-self.guards :].any() | ~same.all())
             on_zero, sizes = on_zero | new, jnp.where(new, 0, sizes)
         grazing = jnp.maximum(last.grazing, if_jumped(last.grazing_here, 0))
-        return y, Regime(sides, modes, changed, on_zero, sizes, grazing)
+        return y, Regime(sides, modes, changed, on_zero, sizes, grazing, late)
 
     def _after_event(
         self, t: Array, y: Integrated, args: Arguments, last: Switches, sides: Array,
         changed: Array, jumped: Truth,
-    ) -> tuple[Integrated, PyTree, Array]:  # fmt: skip
-        """Returns state, modes and sides after an event.
+    ) -> tuple[Integrated, PyTree, Array, Array]:  # fmt: skip
+        """Returns state, modes and sides after an event, and `Switches.late`.
 
         The state moves on to the time of the event in the modes before, and back in
-        those after: this changes nothing but derivatives.
+        those after: but for resets, this changes nothing but derivatives.
         """
         before = args._replace(sides=last.sides, modes=last.modes)
         fired = changed[-self.guards :].reshape(-1, last.modes.mode.size)
         time = jnp.where(last.early, t, last.until)
-        late, there = jnp.zeros_like(t), y
+        late, there, at, resets = jnp.zeros_like(t), y, t, None
+        # What an event causes at once has the time of that event.
+        comes = last.length > 0
         if self.derivatives:
-            arrived = changed & jumped & (last.length > 0)
+            assert last.late is not None
+            arrived = changed & jumped & comes
             late = jax.lax.cond(
                 jnp.any(arrived),
                 lambda: lateness(time, y, before, jnp.argmax(arrived), self.term),
-                lambda: jnp.zeros_like(t),
+                lambda: jnp.where(comes, 0, last.late),
             )
             there = moved(late, time, y, before, self.term)
+        if self.resets:
+            resets = last.resets & jumped
+            which = self._places(len(self.resets), len(self.ends)).start
+            at, there = self._at_zero(
+                t, there, before, which + jnp.argmax(resets), resets.any() & comes
+            )
+        arrived_as = there, before
         own = before._replace(sides=sides)
-        resets = self._met(self.resets, len(self.ends), changed & jumped, sides)
-        event = Event(last.until, t, fired, late, resets)
+        event = Event(last.until, at, fired, late, resets)
         there, modes = self.term.resolve(event, there, own)
         after = args._replace(sides=sides, modes=modes)
         if self.resets:
-            sides = self._sides_after(t, there, after, resets, last)
+            sides = self._sides_after(at, arrived_as, (there, after), resets, last)
             after = args._replace(sides=sides, modes=modes)
+            there = self._later(t - at, at, there, after)
         if self.derivatives:
             there = moved(-late, t + late, there, after, self.term)
-        return there, modes, sides
+        return there, modes, sides, late
 
     def _places(self, count: int, later: int) -> slice:
         """Returns the places of `count` functions before `later` ones and guards."""
@@ -219,18 +245,30 @@ class Events(eqx.Module):
         return passed[own] & ((wanted == 0) | (wanted == after[own]))
 
     def _sides_after(
-        self, t: Array, y: Integrated, args: Arguments, resets: Array, last: Switches
-    ) -> Array:
-        """Returns the sides after resets: of a function that is 0, where it goes."""
+        self, t: Array, before: tuple[Integrated, Arguments],
+        after: tuple[Integrated, Arguments], resets: Array, last: Switches,
+    ) -> Array:  # fmt: skip
+        """Returns the sides after resets; of a function that is 0, where it goes.
+
+        It goes on unless the reset turns its rate round, or stops it: then it is to be
+        reset again. `before`, `after`: states and arguments at the time of the reset.
+        """
         own = self._places(len(self.resets), len(self.ends))
-        rates = self.term.vf(t, y, args)
-        function = lambda t, y: self.term.switches(t, y, args)[0][own]
-        along = jnp.ones_like(t), rates
-        values, slopes = constant(jax.jvp(function, (t, y), along))
-        on_zero = jnp.abs(values) <= jnp.finfo(t.dtype).eps ** 0.5 * last.sizes[own]
-        above = jnp.where(on_zero, slopes, values) > 0
-        side = jnp.where(above, 1.0, -1.0).astype(args.sides.dtype)
-        return args.sides.at[own].set(jnp.where(resets, side, args.sides[own]))
+
+        def at(state: tuple[Integrated, Arguments]) -> tuple[Array, Array]:
+            y, args = state
+            function = lambda t, y: self.term.switches(t, y, args)[0][own]
+            along = jnp.ones_like(t), self.term.vf(t, y, args)
+            return constant(jax.jvp(function, (t, y), along))
+
+        (_, arrives), (values, leaves) = at(before), at(after)
+        eps, sizes, sides = jnp.finfo(t.dtype).eps, last.sizes[own], after[1].sides
+        # As near as steps end to zeros.
+        on_zero = jnp.abs(values) <= 2 * (eps**OFFSET * sizes + ROUNDING * eps)
+        goes_on = jnp.sign(arrives) * jnp.sign(leaves) > 0
+        there = jnp.where(goes_on, -last.sides[own], last.sides[own])
+        side = jnp.where(on_zero, there, jnp.where(values > 0, 1.0, -1.0))
+        return sides.at[own].set(jnp.where(resets, side, sides[own]).astype(t.dtype))
 
     def _shifted(
         self, t: Array, y: Integrated, args: Arguments, last: Switches, jumped: Truth
@@ -299,13 +337,17 @@ class Events(eqx.Module):
         after = jnp.where(passed.switched, -sides, sides)
         after = jnp.where(sides == 0, jnp.where(values[-1] > 0, 1.0, -1.0), after)
         until = jnp.where(passed.crossed, t0 + passed.until * h, t1)
+        passed_zero = passed.switched & ~on_zero
+        resets = None
+        if self.resets:
+            resets = self._met(self.resets, len(self.ends), passed_zero, after)
         found = Found(
             until=until,
             unseen=jnp.where(passed.unseen < 1, t0 + passed.unseen * h, t1),
             soon=t1 + passed.soon * h,
             near=near,
             switched=jnp.any(after != sides),
-            resets=self._resetting(passed.switched, after),
+            resets=None if resets is None else resets.any(),
         )
         return constant(found), Switches(
             sides=sides,
@@ -320,13 +362,10 @@ class Events(eqx.Module):
             grazing=jnp.maximum(passed.missed, regime.grazing),
             grazing_here=passed.grazing,
             modes=regime.modes,
-            ended=self._ended(passed.switched & ~on_zero, after),
+            late=regime.late,
+            resets=resets,
+            ended=self._ended(passed_zero, after),
         )
-
-    def _resetting(self, passed: Array, after: Array) -> Array | None:
-        if not self.resets:
-            return None
-        return self._met(self.resets, len(self.ends), passed, after).any()
 
     def _ended(self, passed: Array, after: Array) -> Array | None:
         """Returns which condition ends the run in a step, see `Switches.ended`.
@@ -349,22 +388,43 @@ class Events(eqx.Module):
         """
         args = args._replace(sides=last.sides, modes=last.modes)
         assert last.ended is not None
-        ended = last.ended >= 0
+        ended, comes = last.ended >= 0, last.length > 0
         which = self._places(len(self.ends), 0).start + last.ended
+        end, there = self._at_zero(t, y, args, which, ended & comes)
+        if last.late is None:
+            return end, there
+        # A jump carried it over its zero: at the time of that event.
+        late = jnp.where(ended & ~comes, last.late, 0)
+        return end + late, moved(late, end, there, args, self.term)
 
-        def later(time: Array) -> tuple[Array, Integrated]:
-            middle = _along(y, time / 2, self.term.vf(t, y, args))
-            rates = self.term.vf(t + time / 2, middle, args)
-            return t + time, _along(y, time, rates)
+    def _at_zero(
+        self, t: Array, y: Integrated, args: Arguments, which: Array, near: Array
+    ) -> tuple[Array, Integrated]:
+        """Returns time and state at the zero of a function, if the state is near it.
 
-        function = lambda time: self.term.switches(*later(time), args)[0][which]
-        time = jnp.zeros_like(t)
+        Else those given, also if there is none, as of what turns back close to it. By
+        Newton's method, to rounding and to second derivatives.
+        """
+        later = lambda time: self._later(time, t, y, args)
+
+        def function(time):
+            return self.term.switches(t + time, later(time), args)[0][which]
+
+        time = change = jnp.zeros_like(t)
         for _ in range(_NEWTON):
             value, slope = jax.jvp(function, (time,), (jnp.ones_like(t),))
-            steep = ended & (slope != 0)
+            steep = near & (slope != 0)
             change = jnp.where(steep, value / jnp.where(steep, slope, 1), 0)
             time = time - change
-        return later(time)
+        time = jnp.where(jnp.abs(change) <= _CONVERGED * jnp.abs(time), time, 0)
+        return t + time, later(time)
+
+    def _later(
+        self, time: Array, t: Array, y: Integrated, args: Arguments
+    ) -> Integrated:
+        """Returns the state a short time later, by the midpoint rule."""
+        middle = _along(y, time / 2, self.term.vf(t, y, args))
+        return _along(y, time, self.term.vf(t + time / 2, middle, args))
 
     def _one_sided(
         self, last: Switches, on_zero: Array, regime: Regime, sizes: Array

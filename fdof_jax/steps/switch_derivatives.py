@@ -20,17 +20,18 @@ from .term import Arguments, Integrated, Term
 class Event(NamedTuple):
     """The instant at which the modes of joints may change.
 
-    - `before`, `t`: times just before it and just after it [s].
+    - `before`, `t`: times just before it and just after it [s]; of a reset, `t` is the
+      very time of its zero.
     - `fired` (kind, joint): which guards of modes came to their zeros.
     - `late`: 0, whose derivatives are those of the time of the event less `before`.
-    - `resets` (reset,): which elements reset the state.
+    - `resets` (reset,): which elements reset the state, None if none can.
     """
 
     before: Array
     t: Array
     fired: Array
     late: Array
-    resets: Array
+    resets: Array | None
 
 
 @jax.custom_jvp

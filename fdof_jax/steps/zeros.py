@@ -39,7 +39,7 @@ _SLOPES = (
 # Steps end where a switching function has passed its zero by this power of the unit of
 # rounding, times its size up to there, and by this multiple of it. There the side to
 # which the motion goes is known even if it began at rest on the zero.
-_OFFSET, _ROUNDING = 0.75, 500
+OFFSET, ROUNDING = 0.75, 500
 _WRONG = 0.375  # power of it, over a size: so far from zero no step has ended
 _SOON = 0.01  # of a step, for extrapolation
 # A function that turns back within this share of its size nearly touches its zero.
@@ -85,11 +85,11 @@ def _margins(
     rows, others = ([side * value for value in part] for part in (values, checks))
     last = [_sum(row, rows) for row in _TERMS[-2:]]
     wrong = [check - _sum(row, rows) for check, row in zip(others, _AT_CHECKS)]
-    rounding = _ROUNDING * eps * (1 + jnp.maximum(before, largest))
+    rounding = ROUNDING * eps * (1 + jnp.maximum(before, largest))
     unsure = _ELSEWHERE * jnp.maximum(_largest([*last, *wrong]) - rounding, 0)
     slopes = [_sum(row, rows) for row in _SLOPES]
     size = _size_of_motion(rows, slopes[0], largest)
-    offset = eps**_OFFSET * size + _ROUNDING * eps
+    offset = eps**OFFSET * size + ROUNDING * eps
     past = [row + offset for row in rows]
     unsure, bend = jnp.where(brief, 0, unsure), _sum(_BEND, rows)
     past, slopes, *others = in_one_loop((past, slopes, offset, largest, unsure, bend))
