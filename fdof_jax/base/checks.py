@@ -302,8 +302,8 @@ def whole_number(name: str, value: Any, minimum: int, most: int | None = None) -
 
 def one_of(name: str, value: object, options: Sequence[Any]) -> Any:
     """Returns `value` if it is among `options`, or raises ValueError."""
-    if isinstance(value, str | int | float) and value in options:
-        return value
+    if isinstance(value, str | int | float | np.number) and value in options:
+        return options[options.index(value)]
     raise refusal(name, f"one of {tuple(options)}", value)
 
 

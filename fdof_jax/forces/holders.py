@@ -91,7 +91,8 @@ class JointFriction(Holder):
     positions and to negative ones. Or they are functions `(t, q, qd, linkage)` that
     return such numbers, positive and smooth in each direction, for instance `stribeck`;
     times at which one jumps are its attribute `jump_ts`. Joints at rest are held by the
-    value at qd = 0. `Solution.taken` does not count a level that is a function.
+    value at qd = 0. Negative values, and static friction below the level, end a motion
+    as not finite. `Solution.taken` does not count a level that is a function.
 
     **Raises:** ValueError for malformed arguments, and for `static` beside `speed`.
 
@@ -135,7 +136,11 @@ class JointFriction(Holder):
         level = self._of_joints("level", joints, at)
         if self.static is None:
             return level, level
-        return level, self._of_joints("static", joints, at)
+        static = self._of_joints("static", joints, at)
+        if at and (callable(self.level) or callable(self.static)):
+            level, static = jnp.broadcast_arrays(level, static)
+            level = jnp.where(static < level, jnp.nan, level)
+        return level, static
 
     def _of_joints(self, name: str, joints: int, at: tuple[Any, ...]) -> Array:
         """Returns friction with an entry per joint, (n,) or (2, n)."""
@@ -149,7 +154,9 @@ class JointFriction(Holder):
             friction = self.value_of(name, t, *state, linkage)
             if jnp.ndim(friction) and friction.shape[-1] != joints:
                 expected = f"it to return numbers for {joints} joints"
-                raise refusal(name, expected, friction)
+                got = f"shape {friction.shape}"
+                raise ValueError(f"{name}: expected {expected}, got {got}.")
+            friction = jnp.where(friction < 0, jnp.nan, friction)
         if jnp.ndim(friction) < 2:
             friction = jnp.broadcast_to(friction, joints)
             if not varies:
@@ -163,7 +170,7 @@ class JointFriction(Holder):
         else:
             rates = zip(each(self.speed, sliding), sliding)
             signs = (jnp.tanh(rate / speed) for speed, rate in rates)
-        level = self._of_joints("level", len(sliding), (scheduled, q, qd, linkage))
+        level, _ = self.levels(len(sliding), scheduled, q, qd, linkage)
         levels = toward(level, sliding)
         return tuple(-x * sign for x, sign in zip(levels, signs))
 

@@ -4,9 +4,10 @@ from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
-from ..base.checks import function, one_of
+from ..base.checks import function, one_of, shown
 from ..linkage.linkage import Linkage
 from .element import Element, Forces, element_of
 from .switches import switch
@@ -22,8 +23,10 @@ class Reset(Element):
     of the jump, `Solution.events` records it (of joint 0), and `Solution.taken` counts
     the energy of links and loads that it takes. It has no efforts.
 
-    After the jump `when` may be 0 still: the next one comes when it has left the zero
-    and passes it again. Jumps that follow each other ever faster, as those of a ball
+    After the jump `when` may be 0 still, or on its other side: the next one comes when
+    it passes its zero again. A motion that starts on the zero does not jump there.
+    Where a blow, a payload or another reset carries `when` over its zero, it jumps at
+    once. A state beyond a hard stop, or not finite, ends the motion. Jumps that follow each other ever faster, as those of a ball
     that comes to rest, end the motion ("too many switches"); `HardStops` hold what
     rests.
 
@@ -87,11 +90,16 @@ class Reset(Element):
 def condition(value: Any, expected: str, q: Array) -> Array:
     """Returns no efforts; the zeros of a number become ends of steps.
 
-    Raises ValueError for what is not one number.
+    Where it is NaN, efforts are, too: no zero would be seen. Raises ValueError for what
+    is not one real number.
     """
-    if jnp.shape(value) != ():
-        raise ValueError(f"{expected}, got one of shape {jnp.shape(value)}.")
-    none = jnp.zeros_like(q)
+    number = isinstance(value, float | int | np.ndarray | np.generic | Array)
+    if not number or jnp.shape(value) != ():
+        got = f"one of shape {jnp.shape(value)}" if number else shown(value)
+        raise ValueError(f"{expected}, got {got}.")
+    if (dtype := jnp.result_type(value)).kind not in "iuf":
+        raise ValueError(f"{expected} which passes 0, got one of type {dtype}.")
+    none = jnp.full_like(q, jnp.where(jnp.isnan(value), jnp.nan, 0))
     # A switch of which nothing depends on the side.
     return switch(jnp.asarray(value, q.dtype), none, none, continuous=True)
 

@@ -32,6 +32,7 @@ from .holding import (
     at_rest,
     laws,
     system_at,
+    within_stops,
 )
 from .prescribed import PrescribedMotion
 from .solution import HAPPENINGS, Events
@@ -294,6 +295,7 @@ def _after_reset(
         with naming(name):
             after = element.state_after(t, *before, arm)
         q, qd = (without_fixed(arm, value) for value in after)
+        qd = jnp.where(within_stops(args.forces, q, arm), qd, jnp.nan)
         masses = args.masses(t)
         energies = (sum(energy(arm, *state, masses)) for state in (before, (q, qd)))
         return (tuple(q - args.q0), tuple(qd), *own), jnp.subtract(*energies)

@@ -17,7 +17,7 @@ from ..forces.reset import Reset
 from ..linkage.linkage import Linkage, joint_names, moving_joints
 from ..mechanics.kinematics import tip_jacobian
 from ..steps.derivative_control import linearised
-from .conditions import conditions_last
+from .conditions import Until, conditions_last
 from .field import (
     args_of,
     effort_and_switches,
@@ -53,6 +53,8 @@ def cause(inputs: Inputs, keywords: Settings, solution: Solution) -> str:
     if outcome in ("out of steps", "tolerance out of reach"):
         return _of_steps(inputs, keywords, solution)
     words = _of_joints(linkage, solution)
+    if outcome == "not finite" and words.endswith("the state is reset. "):
+        return f"{words}Its new values are not finite, or beyond a hard stop."
     if outcome == "too many switches":
         return words + _of_switches(inputs, keywords)
     return words + OUTCOMES[outcome]
@@ -214,11 +216,17 @@ def _linearised(
 def check_arguments(forces: tuple[Element, ...]) -> None:
     """Raises TypeError for a plain function that cannot be called as an element."""
     for k, element in enumerate(forces):
-        if isinstance(element, ForeignElement) and inspect.isfunction(element.called):
+        place = "until" if isinstance(element, Until) else f"forces[{k}]"
+        functions = {"": element}
+        if isinstance(element, Until | Reset):
+            functions = {f".{name}": e for name, e in vars(element).items()}
+        for name, one in functions.items():
+            if not (isinstance(one, ForeignElement) and inspect.isfunction(one.called)):
+                continue
             try:
-                inspect.signature(element.called).bind("t", "q", "qd", "linkage")
+                inspect.signature(one.called).bind("t", "q", "qd", "linkage")
             except TypeError as error:
                 raise TypeError(
-                    f"forces[{k}]: expected a function (t, q, qd, linkage) -> tau, got "
-                    f"one with other arguments: {error}."
+                    f"{place}{name}: expected a function (t, q, qd, linkage), got one "
+                    f"with other arguments: {error}."
                 ) from None

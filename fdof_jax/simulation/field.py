@@ -38,6 +38,7 @@ from ..mechanics.equations import (
 from ..mechanics.rates import conditioning, rates, rates_and_conditioning
 from ..mechanics.solve import divided, minus, solver_of, times, with_added
 from ..steps.term import Health, Integrated, health_if
+from .conditions import Until
 from .prescribed import prescribed
 from .sampling import Sampler, unsampled
 
@@ -362,7 +363,8 @@ def effort_and_switches(
     expected = (
         f"forces[{index}]: expected it to return tau, an array of {len(q)} real numbers"
     )
-    with naming(f"forces[{index}]"), switches.dealt():
+    place = "until" if isinstance(element, Until) else f"forces[{index}]"
+    with naming(place), switches.dealt():
         answer: Any = element.act(t, q, qd, linkage, state)
     if not isinstance(answer, tuple) or len(answer) != 2:
         raise ValueError(

@@ -208,7 +208,7 @@ def _check_constant_steps(forces: tuple[Element, ...], controller: object) -> No
     elif conditions_in(forces):
         why = "come with a condition that ends the motion (until)"
     elif changes(forces):
-        why = "hold joints or take payloads"
+        why = "hold joints, take payloads or reset the state"
     elif sampler_of(forces) and not isinstance(controller, diffrax.ConstantStepSize):
         why = "are sampled (or a ConstantStepSize)"
     if why is not None:

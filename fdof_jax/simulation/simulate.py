@@ -249,7 +249,7 @@ def simulate(
             solution = eqx.tree_at(lambda s: s.ts, solution, ts)
             return _raising(solution, inputs) if throw else solution
     except (TypeError, StopIteration) as error:
-        check_arguments(forces)
+        check_arguments(inputs.forces)
         # After other transformations JAX may find no rule at all, without a word.
         if "forward-mode" in str(error) or isinstance(error, StopIteration):
             raise TypeError(

@@ -85,11 +85,12 @@ class Events(eqx.Module):
     """The last 64 events of joints that elements hold: to which, when and what.
 
     - `t`: times [s]; `joint`: numbers of joints, from 1; `kind`: places of the words in
-      `table`. Each has an entry per event, NaN beyond the last one.
+      `table`. Each has an entry per event, NaN beyond the last one. Resets of the state
+      have the joint 0.
     - `count`: how many there were in all.
     - `table`: a dictionary of columns, "t [s]", "joint" and "event". The words of the
       last are sticks, slips, bounces, rests on its stop, leaves its stop, is braked, is
-      let go, is stopped.
+      let go, is stopped, is reset.
     """
 
     t: Float[Array, " event"]
@@ -137,14 +138,14 @@ class Solution(eqx.Module):
     - `own`: the states of the `StatefulElement`s at `ts`, in the order of the forces;
       each like its `initial_state`, with a leading time axis.
 
-    If elements hold joints for a while (`JointFriction`, `HardStops`, `Brake`) or take
-    a `Payload`, else None (the first `qd` are then those after blows at the start):
+    If elements hold joints for a while (`JointFriction`, `HardStops`, `Brake`), take a
+    `Payload` or `Reset` the state, else None (the first `qd` are then those after blows at the start):
 
     - `modes`: what holds each joint at `ts`, as numbers: 0 nothing, 1 friction, 2 its
       lower stop, 3 its upper stop, 4 a brake. At the very time of an event it may be
       the mode before it or after it.
-    - `taken`: energy that friction, blows, brakes and the catching of payloads have
-      taken up to `ts` [J]; not that of a friction whose level is a function.
+    - `taken`: energy that friction, blows, brakes, resets and the catching of payloads
+      have taken up to `ts` [J]; not that of a friction whose level is a function.
     - `events`: what happened to which joint, and when; its times have derivatives.
 
     - `end`: with `until`, else None: where the motion ended, `end.t`, `end.q` and
