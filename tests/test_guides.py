@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
+from scipy.special import ellipk
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -59,9 +60,24 @@ def test_switches():
     names = run(DOCS / "switches.md")
     assert names["found"].stats["num_switches"] >= 1
     assert names["wet"].stats["num_switches"] >= 1
-    np.testing.assert_allclose(names["kept"], 0.8783656, rtol=1e-6)
-    np.testing.assert_allclose(names["multiplier"], np.cos(0.6) ** 2, rtol=1e-8)
     assert np.isfinite(names["slope"]).all()
+
+
+@pytest.mark.slow
+def test_conditions():
+    names = run(DOCS / "conditions.md")
+    fall, fall_change = np.sqrt(0.35 / 4.905) * ellipk(0.5), 0.25 / 0.35 - 1
+    np.testing.assert_allclose(names["time"], fall, rtol=1e-11)
+    np.testing.assert_allclose(names["change"], fall * fall_change / 2, rtol=1e-9)
+    half = np.sin(0.4) ** 2
+    phases = [2 * np.sqrt(x / 9.81) * ellipk(half / x) for x in (1, 0.6, 1, 0.6)]
+    times = np.cumsum(phases) - phases[0] / 2
+    found = names["swings"].events.table["t [s]"]
+    np.testing.assert_allclose(found, times, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(names["multiplier"], [[names["kept"] ** 2]], rtol=1e-9)
+    locked = np.sqrt(1.5 * names["one"] * names["two"] / 1.3)
+    np.testing.assert_allclose(names["locked"], locked, rtol=1e-10)
+    np.testing.assert_allclose(names["sooner"], -locked / 8, rtol=1e-9)
 
 
 @pytest.mark.slow
