@@ -70,6 +70,62 @@ def test_rows_after_the_end_are_not_there():
     assert (free.end.t, free.end.condition) == (1, -1)
 
 
+def quarter(sine2):
+    """Returns the complete elliptic integral K, by the mean of Gauss."""
+    a, b = 1.0, jnp.sqrt(1 - sine2)
+    for _ in range(6):
+        a, b = (a + b) / 2, jnp.sqrt(a * b)
+    return np.pi / 2 / a
+
+
+def lowest(x, **options):
+    """Returns time, angle and rate of a bar at its lowest point, from rest."""
+    gravity, mass, q0 = x
+    bar = BAR.replace(gravity=gravity, mass=mass[None])
+    there = lambda t, q, qd, linkage: q[0] - HANGS
+    start = fj.State(q0[None], jnp.zeros(1))
+    *end, _ = fj.simulate(bar, start, [0, 9.0], until=there, **options).end
+    return jnp.hstack(end)
+
+
+def lowest_exactly(x):
+    gravity, mass, q0 = x
+    moment, inertia = mass * gravity / 2, 1 / 12 + mass / 4
+    time = jnp.sqrt(inertia / moment) * quarter(jnp.sin((q0 - HANGS) / 2) ** 2)
+    rate = -jnp.sqrt(2 * moment / inertia * (1 + jnp.sin(q0)))
+    return jnp.stack([time, jnp.full_like(time, HANGS), rate])
+
+
+@pytest.mark.slow
+def test_a_bar_comes_to_its_lowest_point_in_the_time_of_an_elliptic_integral():
+    """With first and second derivatives in gravity, its mass and the first angle."""
+    x = jnp.array([9.81, 1.3, 0.0])  # from level
+    at_level = np.sqrt((1 / 12 + 1.3 / 4) / (1.3 * 9.81 / 2)) * ellipk(1 / 2)
+    np.testing.assert_allclose(lowest_exactly(x)[0], at_level, rtol=1e-15)
+    np.testing.assert_allclose(lowest(x), lowest_exactly(x), rtol=0, atol=1e-11)
+    forward = jax.jacfwd(lambda x: lowest(x, **FORWARD))
+    exact = jax.jacfwd(lowest_exactly)
+    for slopes in (forward, jax.jacrev(lowest)):
+        found = jax.jit(slopes, **LOOPS)(x)
+        np.testing.assert_allclose(found, exact(x), rtol=0, atol=1e-10)
+    curves = jax.jit(jax.jacfwd(forward), **LOOPS)(x)
+    np.testing.assert_allclose(curves, jax.jacfwd(exact)(x), rtol=0, atol=1e-10)
+
+
+@pytest.mark.slow
+def test_a_thousand_members_of_a_sweep_end_as_each_does_alone():
+    rng = np.random.default_rng(0)
+    starts = fj.State(rng.uniform(-1.5, 1.5, (1000, 1)), rng.uniform(-3, 3, (1000, 1)))
+    there = Until(lambda t, q, qd, linkage: q[0] - HANGS)
+    swept = fj.sweep(BAR, starts, [0, 9.0], (there,)).end
+    one = jax.jit(lambda start: fj.simulate(BAR, start, [0, 9.0], (there,)).end)
+    alone = [one(fj.State(*rows)) for rows in zip(*starts)]
+    alone = jax.tree.map(lambda *rows: np.stack(rows), *alone)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, atol=1e-10), swept, alone
+    )
+
+
 @pytest.mark.slow
 def test_the_period_of_a_pendulum_and_its_derivative():
     """A bar that starts on the zero returns there, upwards, a period later."""

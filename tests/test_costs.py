@@ -60,6 +60,20 @@ def test_a_scene_without_elements_costs_the_bare_equations():
     assert transcendentals(field, t, (delta, qd), args) == 0
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name, most", [("fig5", 8242), ("fig7", 22110)])
+def test_motions_do_not_pay_for_ends_and_jumps_that_they_lack(name, most):
+    """The programs are no larger than before there were conditions."""
+    linkage, state0, forces, *_ = getattr(scenes, name)()
+    ts = jnp.linspace(0, 1, 12)
+
+    def motion(q):
+        start = fj.State(q, jnp.zeros(3))
+        return fj.simulate(linkage, start, ts, forces, throw=False).q
+
+    assert flops(motion, jnp.asarray(state0.q)) <= most
+
+
 def test_joints_that_are_known_to_be_absent_cost_nothing():
     q, arm = jnp.array([0.3, 2.0, -0.4]), scenes.fig5().linkage
     known, asked = link_constants(arm, q), jax.jit(link_constants)(arm, q)

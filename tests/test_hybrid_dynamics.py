@@ -330,6 +330,47 @@ def test_a_kicked_table_slips_under_its_load():
     )
 
 
+SHAKE, PULSE = 0.1, 6.0  # amplitude [m], rad/s
+
+
+class Shaken(fj.references.Reference):
+    phase: fj.Values = fj.field((), unit="rad")
+
+    def __call__(self, t, linkage):
+        along, angle = jnp.array([1.0, 0.0]), PULSE * t + self.phase
+        x = SHAKE * (jnp.sin(angle) - jnp.sin(self.phase))
+        return x * along, SHAKE * PULSE * jnp.cos(angle) * along
+
+
+@pytest.mark.slow
+def test_a_load_slips_on_a_table_that_moves_sinusoidally():
+    """Its rate is a triangle; it turns where that of the table is as large.
+
+    It slips by 4 A sqrt(1 - (pi f / (2 m A w^2))^2) in each period.
+    """
+    period = 2 * np.pi / PULSE
+    share = lambda level: np.pi * level / (2 * LOAD * SHAKE * PULSE**2)
+
+    def slipped(level, **options):
+        phase = -jnp.arccos(-share(level))
+        friction = fj.forces.JointFriction(level * jnp.array([0.0, 1.0]))
+        motion = on_table(
+            friction, reference=Shaken(phase), qd=(SHAKE * PULSE * jnp.cos(phase), 0.0),
+            ts=(0, period / 2, period, 3 * period), **options,
+        )  # fmt: skip
+        return motion.taken[1:] / level, motion
+
+    right = lambda level: (
+        4 * SHAKE * jnp.sqrt(1 - share(level) ** 2) * jnp.array([0.5, 1, 3])
+    )
+    distance, motion = slipped(3.0)
+    np.testing.assert_allclose(distance, right(3.0), rtol=0, atol=1e-9)
+    back = [-right(3.0)[0], 0, 0]
+    np.testing.assert_allclose(motion.q[1:, 1], back, rtol=0, atol=1e-9)
+    slope = jax.jacfwd(lambda level: slipped(level, adjoint=FORWARD)[0])(3.0)
+    np.testing.assert_allclose(slope, jax.jacfwd(right)(3.0), rtol=0, atol=1e-9)
+
+
 @pytest.mark.slow
 def test_stops_and_brakes_beside_a_kicked_table():
     kick = Kick(0.9, 0.3)

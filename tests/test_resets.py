@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from modes import LOOPS
 from scipy.integrate import solve_ivp
-from test_conditions import BAR, FORWARD, HANGS, MASS, height
+from test_conditions import BAR, FORWARD, HANGS, MASS, height, quarter
 
 import fdof_jax as fj
-from fdof_jax.forces import HardStops, Reset
+from fdof_jax.forces import HardStops, Reset, switch
+from fdof_jax.simulation import Until
 
 
 def bounce(restitution):
@@ -42,6 +43,36 @@ def test_thirty_elastic_jumps_keep_the_energy():
     times = motion.events.table["t [s]"]
     np.testing.assert_allclose(times, fall * (1 + 2 * np.arange(31)), rtol=1e-10)
     np.testing.assert_allclose(motion.taken[-1], 0, atol=1e-9)
+
+
+def after_twenty_blows(x, blow, **options):
+    """Returns the state 0.2 s after the twentieth blow, the energy taken, its time."""
+    q0, gravity, restitution = x
+    arm, start = MASS.replace(gravity=gravity), fj.State(q0[None], jnp.zeros(1))
+    forces = (blow(restitution),)
+    motion = fj.simulate(arm, start, [0, 11.3], forces, **options)
+    last = motion.q[-1], motion.qd[-1], motion.taken[-1], motion.events.t[19]
+    return jnp.hstack(last), motion.events.count
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("jacobian, options", [(jax.jacfwd, FORWARD), (jax.jacrev, {})])
+def test_twenty_blows_have_the_derivatives_of_those_on_a_stop(jacobian, options):
+    x = jnp.array([1.0, 9.81, 0.95])
+    stop = lambda restitution: HardStops(0, np.inf, restitution=restitution)
+
+    def of(blow):
+        def values(x):
+            end, count = after_twenty_blows(x, blow, **options)
+            return end, (end, count)
+
+        return jax.jit(jacobian(values, has_aux=True), **LOOPS)(x)
+
+    (found, (state, count)), (expected, (wanted, _)) = of(bounce), of(stop)
+    assert count == 20
+    np.testing.assert_allclose(state, wanted, rtol=0, atol=1e-9)
+    size = np.linalg.norm(expected, axis=1, keepdims=True)
+    np.testing.assert_allclose(found / size, expected / size, rtol=0, atol=1e-9)
 
 
 def after_jumps(x, **options):
@@ -106,6 +137,43 @@ def test_a_rimless_wheel_has_the_multiplier_of_its_return_map():
     np.testing.assert_allclose(slope_of, kept**2, rtol=1e-8)
 
 
+def pinned(x, **options):
+    """Returns when a string of 1 m hangs: from then on a pin shortens or frees it.
+
+    The bob keeps its velocity there, so that a shorter string turns faster.
+    """
+    short, angle = x
+    side = lambda t, q, qd, linkage: q[0] - HANGS
+    turn = lambda t, q, qd, linkage: (q, qd * jnp.where(qd > 0, 1 / short, short))
+
+    def pull(t, q, qd, linkage):
+        shorter = -(1 / short - 1) * linkage.gravity * jnp.cos(q)
+        return switch(side(t, q, qd, linkage), shorter, 0 * q, continuous=True)
+
+    string = fj.Linkage("R", length=[0, 1], com=[[1, 0]], mass=[1], inertia=[0])
+    start = fj.State((HANGS - angle)[None], jnp.zeros(1))
+    forces = Reset(side, turn), pull
+    return fj.simulate(string, start, [0, 8.2], forces, **options).events.t[:9]
+
+
+def pinned_exactly(x):
+    short, angle = x
+    half = jnp.sin(angle / 2) ** 2
+    of = lambda length: 2 * jnp.sqrt(length / 9.81) * quarter(half / length)
+    phases = jnp.stack([of(1.0), of(short)])[jnp.arange(9) % 2]
+    return jnp.cumsum(phases.at[0].divide(2))
+
+
+@pytest.mark.slow
+def test_a_string_meets_a_pin_nine_times():
+    x = jnp.array([0.6, 0.8])
+    np.testing.assert_allclose(pinned(x), pinned_exactly(x), rtol=0, atol=1e-9)
+    expected = jax.jacfwd(pinned_exactly)(x)
+    for slopes in (jax.jacfwd(lambda x: pinned(x, **FORWARD)), jax.jacrev(pinned)):
+        found = jax.jit(slopes, **LOOPS)(x)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8)
+
+
 @pytest.mark.slow
 def test_a_pendulum_that_is_kicked_is_that_of_scipy():
     kick = Reset(
@@ -126,6 +194,17 @@ def test_a_pendulum_that_is_kicked_is_that_of_scipy():
     forces = (kick, fj.JointDamper(0.1))
     motion = fj.simulate(BAR, fj.State([-0.6], [0.0]), [0, 6.0], forces)
     np.testing.assert_allclose([motion.q[-1, 0], motion.qd[-1, 0]], y, atol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("restitution", [0.0, 0.2, 0.5, 0.8])
+def test_a_ball_that_comes_to_rest_does_not_fall_through(restitution):
+    """Its jumps follow each other ever faster: the run ends by a name."""
+    start, ts = fj.State([1.0], [0.0]), [0, 9.0]
+    forces = (bounce(jnp.array(restitution)),)
+    run = lambda: fj.simulate(MASS, start, ts, forces, max_steps=2000)
+    with pytest.raises(RuntimeError, match="not finite|too many switches|out of steps"):
+        run()
 
 
 @pytest.mark.slow
@@ -156,6 +235,23 @@ def test_jumps_that_follow_each_other_ever_faster_are_named():
         fj.simulate(*scene)
 
 
+NONE = lambda t, q, qd, linkage: jnp.nan * q[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "element, words",
+    [
+        (Until(NONE), r"effort of forces\[0\] is not finite"),
+        (Reset(NONE, lambda t, q, qd, linkage: (q, qd)), r"forces\[0\] is not finite"),
+        (Reset(height, lambda t, q, qd, linkage: (q, jnp.nan * qd)), "is reset"),
+    ],
+)
+def test_functions_that_return_nan_are_named(element, words):
+    with pytest.raises(RuntimeError, match=words):
+        fj.simulate(MASS, fj.State([1.0], [0.0]), [0, 1.0], (element,))
+
+
 def test_what_is_refused():
     start, same = fj.State([1.0], [0.0]), lambda t, q, qd, linkage: (q, qd)
 
@@ -167,6 +263,8 @@ def test_what_is_refused():
         run(lambda t, q, qd, linkage: q, same)
     with pytest.raises(ValueError, match=r"^forces\[0\].then: .*, got no pair"):
         run(height, lambda t, q, qd, linkage: q)
+    with pytest.raises(ValueError, match=r"^forces\[0\].then: .* \[\(1,\), \(2,\)\]"):
+        run(height, lambda t, q, qd, linkage: (q, jnp.ones(2)))
     with pytest.raises(ValueError, match="^when: expected a function"):
         Reset(3, same)
     with pytest.raises(ValueError, match="^direction: expected one of"):

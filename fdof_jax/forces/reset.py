@@ -26,9 +26,9 @@ class Reset(Element):
     After the jump `when` may be 0 still, or on its other side: the next one comes when
     it passes its zero again. A motion that starts on the zero does not jump there.
     Where a blow, a payload or another reset carries `when` over its zero, it jumps at
-    once. A state beyond a hard stop, or not finite, ends the motion. Jumps that follow each other ever faster, as those of a ball
-    that comes to rest, end the motion ("too many switches"); `HardStops` hold what
-    rests.
+    once. Jumps that follow each other ever faster, as those of a ball that comes to
+    rest, end the motion ("too many switches"): `HardStops` hold what rests. So does a
+    new state that is not finite or beyond a hard stop ("not finite").
 
     **Arguments:**
 

@@ -139,7 +139,8 @@ class Solution(eqx.Module):
       each like its `initial_state`, with a leading time axis.
 
     If elements hold joints for a while (`JointFriction`, `HardStops`, `Brake`), take a
-    `Payload` or `Reset` the state, else None (the first `qd` are then those after blows at the start):
+    `Payload` or `Reset` the state, else None (the first `qd` are then those after blows
+    at the start):
 
     - `modes`: what holds each joint at `ts`, as numbers: 0 nothing, 1 friction, 2 its
       lower stop, 3 its upper stop, 4 a brake. At the very time of an event it may be
