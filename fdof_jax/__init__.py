@@ -19,7 +19,7 @@ Units are SI. `help` of a name says the rest; its room holds more of its kind.
 - **Afterwards**, room `analysis`: joint_efforts, joint_reactions, linearize.
 - **Gains**, room `tuning`: tune, TuneResult. **Parameters from recordings**, room
   `identification`: fit, FitResult.
-- **Pictures**: drawing, plotting. **Files and tables**, room `data`: save,
+- **Pictures**: view, drawing, plotting. **Files and tables**, room `data`: save,
   load, to_pandas, to_xarray, to_mjcf, from_mjcf.
 - **The paper's figures**: scenes.
 """
@@ -80,6 +80,7 @@ from .tuning.tuning import tune
 
 if TYPE_CHECKING:
     from .pictures import drawing, plotting
+    from .viewer.view import view
 
 # Last, as `mjcf` imports names from above.
 from . import data
@@ -95,7 +96,8 @@ __all__ = [
     "PDController", "plotting", "Point", "references", "save", "Scene", "scenes",
     "simulate", "simulate_sampled", "simulation", "Solution", "SpringDamper", "State",
     "step", "sweep", "tip_jacobian", "tip_position", "TipTask", "to_mjcf", "to_pandas",
-    "to_xarray", "TOPOLOGIES", "tune", "TuneResult", "tuning", "Values", "Wrench",
+    "to_xarray", "TOPOLOGIES", "tune", "TuneResult", "tuning", "Values", "view",
+    "Wrench",
 ]  # fmt: skip
 
 
@@ -109,4 +111,6 @@ if not TYPE_CHECKING:  # a checker of types would then accept any name
         # Pictures are imported on first use, as they need matplotlib.
         if name in ("drawing", "plotting"):
             return importlib.import_module(f".pictures.{name}", __name__)
+        if name == "view":
+            return importlib.import_module(".viewer.view", __name__).view
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

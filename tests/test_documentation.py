@@ -76,13 +76,8 @@ NAMES = [
     *(
         f"{module.__name__.split('.')[-1]}.{name}"
         for module in (drawing, plotting)
-        for name, value in inspect.getmembers(module, inspect.isfunction)
-        if value.__module__.startswith("fdof_jax.pictures")
-        # Pictures draw into the axes or figure given, or into new ones.
-        and {"ax", "fig"} & {
-            p.name for p in inspect.signature(value).parameters.values()
-            if p.default is None
-        }
+        for name in module.__all__
+        if inspect.isfunction(getattr(module, name))
     ),
 ]  # fmt: skip
 # Classes of results: the function that returns each.

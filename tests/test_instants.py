@@ -51,8 +51,8 @@ OTHERS = {
     fj.simulate, fj.simulate_sampled, fj.step, fj.sweep, fj.joint_efforts,
     fj.joint_reactions, analysis.response, plotting.effort_profile,
     plotting.energy_stack, plotting.motion_profile, drawing.animate,
-    drawing.animate_grid, drawing.draw_linkage, drawing.topology_grid, fj.to_mjcf,
-    fj.forces.elements_on,
+    drawing.animate_grid, drawing.draw_linkage, drawing.geometry,
+    drawing.topology_grid, fj.to_mjcf, fj.view, fj.forces.elements_on,
 }  # fmt: skip
 
 

@@ -14,7 +14,7 @@ import pytest
 import fdof_jax as fj
 
 # Folders that import from public rooms alone, as a user does: see test_leaves.py.
-LEAVES = ("mjcf",)
+LEAVES = "mjcf", "viewer"
 FOLDER = Path(fj.__file__).parent
 ROOT = Path(__file__).parents[1]
 
@@ -131,8 +131,8 @@ def test_the_import_takes_what_simulation_needs():
     assert "diffrax" in modules
     # JAX and diffrax import none of these themselves.
     assert not modules & {
-        "control", "matplotlib", "mujoco", "optax", "pandas",
-        "scipy.interpolate", "scipy.linalg", "scipy.optimize", "xarray", "zarr",
+        "control", "fdof_jax.viewer", "IPython", "matplotlib", "mujoco", "optax",
+        "pandas", "scipy.interpolate", "scipy.linalg", "scipy.optimize", "xarray", "zarr",
     }  # fmt: skip
     assert "matplotlib" in imported("import fdof_jax as fj; fj.plotting")
 

@@ -8,24 +8,31 @@ from matplotlib.lines import Line2D
 from matplotlib.markers import MarkerStyle
 from matplotlib.path import Path
 from matplotlib.typing import ColorType
+from numpy.typing import ArrayLike
 
+from ..base.checks import real_numbers
 from ..base.known_values import in_numpy
 from ..forces.element import Forces
 from ..linkage.frames import known_frames
-from ..linkage.linkage import Linkage, without_fixed
+from ..linkage.linkage import Linkage, check_linkage, joints_of, without_fixed
 from .axes import BLACK, GREY, SERIES, Keywords, xy
 from .elements import ELEMENT_STYLES, element_lines, element_marker
 
 
 class Geometry(NamedTuple):
-    """A linkage at all samples; points of the plane are complex numbers.
+    """A linkage at all samples; points of the plane are complex numbers x + iy [m].
 
     Link 0 is the ground, links 1 to n move; joint k is between links k - 1 and k.
+
+    - `angle`: absolute angles of links 0 to n [rad]: (time, n + 1).
+    - `kinds`: R, P or F of each joint.
+    - `points`: the corners of each part's line, (time, corner), by the names that
+      `draw_linkage` lists, in the order of drawing; NaN lifts the pen.
     """
 
-    angle: np.ndarray  # absolute angles of links 0 to n [rad]: (time, n + 1)
-    kinds: str  # R, P or F of each joint
-    points: dict[str, np.ndarray]  # by name of the part, in drawing order: (time, ...)
+    angle: np.ndarray
+    kinds: str
+    points: dict[str, np.ndarray]
 
     @property
     def tip(self) -> np.ndarray:
@@ -41,12 +48,24 @@ class Geometry(NamedTuple):
 
 
 def geometry(
-    linkage: Linkage, q: np.ndarray, ts: np.ndarray | None = None, forces: Forces = ()
+    linkage: Linkage, q: ArrayLike, ts: ArrayLike | None = None, forces: Forces = ()
 ) -> Geometry:
-    """The `Geometry` of a linkage at joint positions (time, n).
+    """Computes the points of a linkage's parts along a motion, for other renderers.
 
-    With the times `ts` [s], the force elements that have a place are behind the arm.
+    **Arguments:** `q`: joint positions (time, n) [m or rad]; `ts`: their times [s], with
+    which the `forces` that have a place are parts too, behind the arm.
+
+    **Returns:** `Geometry(angle, kinds, points)`.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> fj.drawing.geometry(arm, [[0, 0, 0]]).points["tip 3"].tolist()  # [m]
+    [[(3+0j)]]
     """
+    check_linkage(linkage)
+    q = np.asarray(real_numbers("q", q, (None, joints_of(linkage))))
+    if ts is not None:
+        ts = np.asarray(real_numbers("ts", ts, (len(q),)))
     arm = in_numpy(linkage)
     kinds = arm.topology
     f = known_frames(arm, without_fixed(arm, q))

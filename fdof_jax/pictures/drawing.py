@@ -50,7 +50,7 @@ from .axes import (
 
 __all__ = [
     "BLACK", "GREY", "SERIES", "animate", "animate_grid", "chrono_cyclograph",
-    "draw_linkage", "topology_grid",
+    "draw_linkage", "geometry", "topology_grid",
 ]  # fmt: skip
 
 

@@ -1,0 +1,1 @@
+"""A window on motions: a page that plays them in a browser, written by `view`."""

@@ -1,0 +1,93 @@
+"""The motions of a page: one, several by title, or the members of a batch."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax.core import Tracer
+
+from .. import Linkage, Solution
+
+
+class Motion(NamedTuple):
+    """A motion of one arm, up to its last finite row."""
+
+    title: str
+    linkage: Linkage
+    solution: Solution  # in NumPy
+    forces: tuple[Any, ...]
+    rows: int
+
+
+def refusal(name: str, expected: str, got: object) -> ValueError:
+    """Returns the error to raise for a malformed argument."""
+    text = "".join(filter(str.isprintable, " ".join(repr(got).split())))
+    return ValueError(f"{name}: expected {expected}, got {text[:200]}.")
+
+
+def motions_of(linkage: Any, solution: Any, forces: Any) -> list[Motion]:
+    """Returns the motions to show, or raises ValueError."""
+    given = {"linkage": linkage, "solution": solution, "forces": forces}
+    if not isinstance(solution, Mapping):
+        for name in "linkage", "forces":
+            if isinstance(given[name], Mapping):
+                expected = "no dictionary, as the solution is none"
+                raise refusal(name, expected, given[name])
+        return _members("", given, "")
+    if not solution:
+        raise refusal("solution", "at least one motion", solution)
+    for name, value in given.items():
+        if isinstance(value, Mapping) and value.keys() != solution.keys():
+            expected = f"the titles of the motions, {[*solution]}"
+            raise refusal(name, expected, [*value])
+    found = []
+    for title in solution:
+        if not isinstance(title, str):
+            raise refusal("solution", "titles that are texts", title)
+        own = {
+            name: value[title] if isinstance(value, Mapping) else value
+            for name, value in given.items()
+        }
+        found += _members(title, own, f"[{ascii(title)}]")
+    return found
+
+
+def _members(title: str, given: dict[str, Any], place: str) -> list[Motion]:
+    """Returns a motion, or those of a batch; `place`: of the title, for messages."""
+    for name, kind in ("linkage", Linkage), ("solution", Solution):
+        if not isinstance(given[name], kind):
+            raise refusal(name + place, f"a {kind.__name__}", given[name])
+        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(given[name])):
+            raise refusal(name + place, "known values", given[name])
+    linkage, solution = (_in_numpy(given[name]) for name in ("linkage", "solution"))
+    batch, joints = np.shape(solution.q)[:-2], np.shape(linkage.ef)[-1] // 2
+    if np.ndim(solution.q) < 2 or np.shape(solution.q)[-1] != joints:
+        expected = f"a motion of {joints} joints, as the linkage has"
+        raise refusal("solution" + place, expected, solution)
+    if np.shape(linkage.ef)[:-1] not in ((), batch):
+        expected = f"one arm, or a batch of shape {batch}, as the motions are"
+        raise refusal("linkage" + place, expected, linkage)
+    found = []
+    for index in np.ndindex(batch):
+        arm = linkage if np.ndim(linkage.ef) == 1 else _at(index, batch, linkage)
+        one = _at(index, batch, solution)
+        finite = np.isfinite(one.q).all(axis=1)
+        member = "member " + ", ".join(map(str, index)) if batch else ""
+        words = ": ".join(filter(None, (title, member)))
+        found.append(Motion(words, arm, one, given["forces"], int(finite.sum())))
+    found = [motion for motion in found if motion.rows]
+    if not found:
+        raise refusal("solution" + place, "at least one finite row", solution)
+    return found
+
+
+def _in_numpy(tree: Any) -> Any:
+    known = lambda leaf: np.asarray(leaf) if isinstance(leaf, jax.Array) else leaf
+    return jax.tree.map(known, tree)
+
+
+def _at(index: tuple[int, ...], batch: tuple[int, ...], tree: Any) -> Any:
+    """Returns a member; what has no axes of the batch is the same for all."""
+    has = lambda leaf: batch and np.shape(leaf)[: len(batch)] == batch
+    return jax.tree.map(lambda leaf: leaf[index] if has(leaf) else leaf, tree)

@@ -1,0 +1,95 @@
+"""`view`: a page that plays motions in a browser, in one file."""
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from .. import Linkage, Solution
+from ..simulation import accepts_scene
+from .data import page_data
+from .motions import motions_of, refusal
+from .still import still_picture
+
+_TEMPLATE = Path(__file__).with_name("page.html")
+
+
+@dataclass(frozen=True)
+class View:
+    """A page that plays motions: its file's `path`, and its text, `html`.
+
+    A notebook shows the page itself.
+    """
+
+    path: Path
+    html: str = field(repr=False)
+
+    def _repr_html_(self) -> str:
+        return (
+            f'<iframe srcdoc="{escape(self.html)}" title="motion" allowfullscreen '
+            'style="width:100%;height:700px;border:0"></iframe>'
+        )
+
+
+@accepts_scene
+def view(
+    linkage: Linkage | Mapping[str, Linkage],
+    solution: Solution | Mapping[str, Solution],
+    forces: tuple[Any, ...] | Mapping[str, tuple[Any, ...]] = (),
+    path: str | os.PathLike[str] = "motion.html",
+) -> View:
+    """Writes a page that plays a motion in any browser, and curves over time beside it.
+
+    The page is one file, which needs no network: it can be sent by mail. It draws the
+    arm and what acts on it as `drawing.draw_linkage` does, the path of the tip, the
+    curves of positions [rad, m], velocities, efforts [N m, N] and energies [J], and
+    marks events and what holds joints. Energies are those of `energy` with the forces.
+    Between two rows positions are interpolated linearly. Numbers have 32 bits.
+
+    **Arguments:**
+
+    - `solution`: that of one `simulate` or `simulate_sampled`, whose forces are
+      `(control, *forces)`; of a failed one, the rows reached are shown. A batch shows
+      all members, one in full, the others as ghosts. A dictionary, title -> solution,
+      compares motions, laid over each other or side by side.
+    - `linkage`, `forces`: those of the solution. With a dictionary of solutions, each
+      may be a dictionary of the same titles; else they are the same for all. A batch of
+      arms belongs to a batch of motions; the forces are the same for all its members.
+    - `path`: of the file, which is replaced.
+
+    A `Scene` may stand for linkage and forces: `view(scene, solution)`.
+
+    **Returns:** a `View`, with the file's `path`; as the last line of a notebook's cell
+    it shows the page.
+
+    **Raises:** ValueError for malformed arguments and for a file that cannot be written.
+
+    >>> import fdof_jax as fj
+    >>> scene = fj.scenes.fig5()
+    >>> motion = fj.simulate(scene, [0, 0.05, 0.1])
+    >>> folder = getfixture("tmp_path")
+    >>> fj.view(scene, motion, folder / "fall.html").path.name
+    'fall.html'
+    """
+    motions = motions_of(linkage, solution, forces)
+    if not isinstance(path, str | os.PathLike) or not os.fspath(path):
+        raise refusal("path", "the path of a file", path)
+    # No text in the data ends the script that holds it.
+    data = json.dumps(page_data(motions)).replace("<", "\\u003c")
+    title = ", ".join(dict.fromkeys(motion.linkage.topology for motion in motions))
+    html = _TEMPLATE.read_text(encoding="utf-8")
+    for name, text in (
+        ("title", escape(title)),
+        ("still", still_picture(motions[0])),
+        ("data", data),
+    ):
+        html = html.replace(f"<!--{name}-->", text, 1)
+    file = Path(path)
+    try:
+        file.write_text(html, encoding="utf-8")
+    except (OSError, ValueError) as error:
+        raise refusal("path", "the path of a file that can be written", path) from error
+    return View(file, html)
