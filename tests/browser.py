@@ -19,11 +19,9 @@ FLAGS = [
 ]  # fmt: skip
 
 
-def missing() -> str:
-    """Names the programs that are not installed here; "" if all are."""
-    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
-    found = {"chromium": chromium, "chromedriver": shutil.which("chromedriver")}
-    return " and ".join(name for name, place in found.items() if not place)
+NAMES = "chromium", "chromium-browser", "google-chrome"
+PROGRAM = next(filter(None, map(shutil.which, NAMES)), None)
+DRIVER = shutil.which("chromedriver")
 
 
 class Browser:
@@ -31,16 +29,20 @@ class Browser:
 
     def __init__(self, address: str, profile: str):
         self.address = address
-        program = shutil.which("chromium") or shutil.which("chromium-browser")
-        options = {"binary": program, "args": [*FLAGS, f"--user-data-dir={profile}"]}
-        wanted = {"goog:chromeOptions": options, "goog:loggingPrefs": {"browser": "ALL"}}
+        options = {"binary": PROGRAM, "args": [*FLAGS, f"--user-data-dir={profile}"]}
+        wanted = {
+            "goog:chromeOptions": options,
+            "goog:loggingPrefs": {"browser": "ALL"},
+        }
         reply = self.post("/session", {"capabilities": {"alwaysMatch": wanted}})
         self.address += f"/session/{reply['sessionId']}"
 
     def post(self, place: str, body: Any, method: str = "POST") -> Any:
         text = json.dumps(body).encode() if method == "POST" else None
         kind = {"Content-Type": "application/json"}
-        request = urllib.request.Request(self.address + place, text, kind, method=method)
+        request = urllib.request.Request(
+            self.address + place, text, kind, method=method
+        )
         # No proxy is asked: the driver is on this machine.
         opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
         try:
@@ -53,10 +55,11 @@ class Browser:
         self.post("/url", {"url": path.resolve().as_uri()})
 
     def run(self, script: str, *arguments: Any) -> Any:
-        """Runs the body of a function and returns its result, also that of a promise."""
+        """Runs the body of a function and returns its result, or that of a promise."""
         return self.post("/execute/sync", {"script": script, "args": arguments})
 
     def press(self, *keys: str) -> None:
+        """Presses keys by their names in events, one after the other."""
         for key in keys:
             self.run(
                 "document.body.dispatchEvent(new KeyboardEvent('keydown', "
@@ -74,6 +77,14 @@ class Browser:
 
     def devtools(self, command: str, **parameters: Any) -> Any:
         return self.post("/goog/cdp/execute", {"cmd": command, "params": parameters})
+
+    def mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
+        """Moves, presses, releases or turns the mouse at a place of the page."""
+        held = kind in ("mousePressed", "mouseMoved")
+        self.devtools(
+            "Input.dispatchMouseEvent", type=kind, x=x, y=y, clickCount=1, **more,
+            button="none" if kind == "mouseWheel" else "left", buttons=int(held),
+        )  # fmt: skip
 
     def size(self, width: int, height: int) -> None:
         self.devtools(
@@ -98,9 +109,9 @@ class Browser:
 @contextlib.contextmanager
 def browser():
     """Starts a browser and ends it."""
-    driver = subprocess.Popen(
-        ["chromedriver", "--port=0"], stdout=subprocess.PIPE, text=True
-    )
+    assert DRIVER
+    command = [DRIVER, "--port=0"]
+    driver = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         assert driver.stdout
         lines = iter(driver.stdout.readline, "")

@@ -132,7 +132,8 @@ def test_the_import_takes_what_simulation_needs():
     # JAX and diffrax import none of these themselves.
     assert not modules & {
         "control", "fdof_jax.viewer", "IPython", "matplotlib", "mujoco", "optax",
-        "pandas", "scipy.interpolate", "scipy.linalg", "scipy.optimize", "xarray", "zarr",
+        "pandas", "scipy.interpolate", "scipy.linalg", "scipy.optimize", "xarray",
+        "zarr",
     }  # fmt: skip
     assert "matplotlib" in imported("import fdof_jax as fj; fj.plotting")
 

@@ -52,8 +52,8 @@ def geometry(
 ) -> Geometry:
     """Computes the points of a linkage's parts along a motion, for other renderers.
 
-    **Arguments:** `q`: joint positions (time, n) [m or rad]; `ts`: their times [s], with
-    which the `forces` that have a place are parts too, behind the arm.
+    **Arguments:** `q`: joint positions (time, n) [m or rad]; `ts`: their times [s],
+    with which the `forces` that have a place are parts too, behind the arm.
 
     **Returns:** `Geometry(angle, kinds, points)`.
 

@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from .. import Linkage, drawing, energy, joint_efforts
+from .. import drawing, energy, joint_efforts
 from ..forces import InertialElement, elements_on
 from .lines import lines_of
 from .motions import Motion
@@ -58,7 +58,8 @@ def box_of(parts: dict[str, np.ndarray]) -> list[float]:
 
 
 def _shown(motion: Motion, arrays: Arrays) -> dict[str, Any]:
-    arm, solution, rows = motion.linkage, motion.solution, slice(motion.rows)
+    arm: Any = motion.linkage  # in NumPy
+    solution, rows = motion.solution, slice(motion.rows)
     g, put = geometry(motion), arrays.put
     box = box_of(g.points)
     size = max(box[2] - box[0], box[3] - box[1], 1e-9)
@@ -111,24 +112,20 @@ def _series(motion: Motion, arrays: Arrays) -> list[dict[str, Any]]:
 
 def _energies(motion: Motion) -> tuple[np.ndarray, np.ndarray]:
     """Kinetic and potential energy of the arm and of what acts on it (time,) [J]."""
-    solution, forces = motion.solution, motion.forces
+    solution, rows = motion.solution, slice(motion.rows)
     # The control of a sampled motion is none of the elements.
-    forces = elements_on(motion.linkage, forces[solution.acting is not None :])
-    energies = _energies_of_rows(
-        motion.linkage, forces, solution.ts, solution.q, solution.qd
-    )
-    kinetic, potential = (np.asarray(e)[: motion.rows] for e in energies)
-    return kinetic, potential
+    controls = int(solution.acting is not None)
+    forces = elements_on(motion.linkage, motion.forces[controls:])
 
-
-def _energies_of_rows(
-    linkage: Linkage, forces: tuple[Any, ...], *rows: np.ndarray
-) -> tuple[jax.Array, jax.Array]:
     def of_row(t, q, qd):
-        present = tuple(e.at(t) if isinstance(e, InertialElement) else e for e in forces)
-        return energy(linkage, q, qd, present)
+        present = tuple(
+            e.at(t) if isinstance(e, InertialElement) else e for e in forces
+        )
+        return energy(motion.linkage, q, qd, present)
 
-    return jax.vmap(of_row)(*rows)
+    energies = jax.vmap(of_row)(solution.ts, solution.q, solution.qd)
+    kinetic, potential = (np.asarray(values)[rows] for values in energies)
+    return kinetic, potential
 
 
 def _events(motion: Motion) -> list[list[Any]]:
@@ -139,13 +136,11 @@ def _events(motion: Motion) -> list[list[Any]]:
         table = solution.events.table
         for t, joint, word in zip(table["t [s]"], table["joint"], table["event"]):
             name = f"{motion.linkage.topology[joint - 1]}{joint}"
-            found.append([float(t), f"{name} {word}"])
+            found.append((t, f"{name} {word}"))
     if solution.end is not None and solution.ended:
         number = int(solution.end.condition)
-        found.append([float(solution.end.t), f"condition {number} ends the motion"])
-    return [event for event in found if event[0] <= last] + [
-        [float(last), text] for t, text in found if t > last
-    ]
+        found.append((solution.end.t, f"condition {number} ends the motion"))
+    return [[float(min(t, last)), text] for t, text in found]
 
 
 def _ending(motion: Motion) -> str:

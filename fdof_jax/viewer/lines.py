@@ -2,14 +2,13 @@
 
 A line (time, corner) of points x + iy [m] that is fixed to links is a sum of columns
 (time) times coefficients (corner). The columns are, in this order: the directions of
-links 0 to n, the starts of links 1 to n, and further ones for what moves in another way,
-such as a spring's width or an arrow's length.
+links 0 to n, the starts of links 1 to n, and further ones for what moves in another
+way, such as a spring's width or an arrow's length.
 """
 
 from typing import NamedTuple
 
 import numpy as np
-
 
 
 class Line(NamedTuple):
@@ -24,8 +23,8 @@ def lines_of(
 ) -> tuple[list[Line], list[np.ndarray]]:
     """Returns the lines of parts, and the further columns.
 
-    `angle`: of links 0 to n (time, n + 1) [rad]; `parts`: points (time, corner) by name;
-    `small`: what nobody sees [m].
+    `angle`: of links 0 to n (time, n + 1) [rad]; `parts`: points (time, corner) by
+    name; `small`: what nobody sees [m].
     """
     starts = [parts[f"link {k}"][:, 0] for k in range(1, angle.shape[1])]
     frames = np.column_stack([np.exp(1j * angle), *starts])

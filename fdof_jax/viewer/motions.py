@@ -15,7 +15,7 @@ class Motion(NamedTuple):
 
     title: str
     linkage: Linkage
-    solution: Solution  # in NumPy
+    solution: Any  # a Solution, in NumPy
     forces: tuple[Any, ...]
     rows: int
 

@@ -21,7 +21,7 @@ def still_picture(motion: Motion) -> str:
 
     def path(points: np.ndarray) -> str:
         pen, words = "M", []
-        for x, y in zip(points.real - left, high - points.imag):
+        for x, y in zip(np.real(points) - left, high - np.imag(points)):
             if np.isnan(x):
                 pen = "M"
             else:

@@ -65,7 +65,7 @@ def view(
     **Returns:** a `View`, with the file's `path`; as the last line of a notebook's cell
     it shows the page.
 
-    **Raises:** ValueError for malformed arguments and for a file that cannot be written.
+    **Raises:** ValueError for malformed arguments and a file that cannot be written.
 
     >>> import fdof_jax as fj
     >>> scene = fj.scenes.fig5()
