@@ -152,7 +152,7 @@ def test_a_click_on_a_curve_jumps_there(one):
         "const box = document.querySelector('.plot').getBoundingClientRect();"
         "return [box.x, box.y + 40, box.width]"
     )
-    middle = x + 46 + (width - 54) / 2
+    middle = x + 52 + (width - 60) / 2  # between the margins
     for kind in ("mousePressed", "mouseReleased"):
         one.mouse(kind, middle, y)
     one.drawn()

@@ -53,8 +53,8 @@ def box_of(parts: dict[str, np.ndarray]) -> list[float]:
     """Returns the bounds x, y below and above of all points [m]."""
     points = np.concatenate([part.ravel() for part in parts.values()])
     points = points[~np.isnan(points)]
-    ends = points.real.min(), points.imag.min(), points.real.max(), points.imag.max()
-    return [float(end) for end in ends]
+    x, y = np.real(points), np.imag(points)
+    return [float(end) for end in (x.min(), y.min(), x.max(), y.max())]
 
 
 def _shown(motion: Motion, arrays: Arrays) -> dict[str, Any]:

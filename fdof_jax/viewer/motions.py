@@ -74,7 +74,7 @@ def _members(title: str, given: dict[str, Any], place: str) -> list[Motion]:
         one = _at(index, batch, solution)
         finite = np.isfinite(one.q).all(axis=1)
         member = "member " + ", ".join(map(str, index)) if batch else ""
-        words = ": ".join(filter(None, (title, member)))
+        words = ": ".join(filter(None, (title, member))) or f"{arm.topology} arm"
         found.append(Motion(words, arm, one, given["forces"], int(finite.sum())))
     found = [motion for motion in found if motion.rows]
     if not found:

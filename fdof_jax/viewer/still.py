@@ -62,8 +62,8 @@ def still_picture(motion: Motion) -> str:
     box = -pad, -pad, right - left + 2 * pad, high - low + 2 * pad
     view_box = " ".join(f"{number:.4g}" for number in box)
     times = motion.solution.ts[[0, motion.rows - 1]]
-    words = escape(f"{motion.title} from {times[0]:g} to {times[1]:g} s".strip())
+    words = escape(f"{motion.title}, {times[0]:g} to {times[1]:g} s")
     return (
         f'<svg viewBox="{view_box}" role="img" aria-label="{words}">'
-        f"{''.join(drawn)}</svg><p>{words}. Scripts are off: with them, it moves.</p>"
+        f"{''.join(drawn)}</svg><p>{words}. It moves where scripts are on.</p>"
     )
