@@ -217,7 +217,7 @@ def animate(
     **Returns:** the animation; a notebook plays it if it is the last line of a cell.
     In a new figure a legend names every mark. Keep the animation until it is shown.
     `.save("motion.gif")` and `.save("motion.mp4")` write it with a progress bar, the
-    latter with ffmpeg; `.to_jshtml()` returns a player as text, for a web page.
+    latter with ffmpeg. For a web page there is `fj.view`.
     """
     ts, q, _ = reached(linkage, solution)
     shown = ts <= _last(ts, until)
