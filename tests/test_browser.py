@@ -132,8 +132,9 @@ def test_it_plays_and_stops_at_the_end(one):
     assert one.run("return document.getElementById('play').ariaLabel") == "pause"
     scrub(one, 1.99)
     one.run(
-        "return new Promise(done => { const wait = () => document.getElementById('play')"
-        ".ariaLabel === 'play' ? done(1) : setTimeout(wait, 20); wait(); })"
+        "const play = document.getElementById('play');"
+        "return new Promise(done => { const wait = () => play.ariaLabel === 'play' ?"
+        " done(1) : setTimeout(wait, 20); wait(); })"
     )
     assert time_of(one) == 2
 
