@@ -156,5 +156,5 @@ def test_what_has_no_place_is_not_drawn_and_points_elsewhere_are_refused():
 def test_a_legend_shows_each_kind_by_its_symbol():
     ax = drawing.draw_linkage(ARM, Q, forces=(fj.SpringDamper(HOOK, TIP, **HELD),))
     _, labels = ax.get_legend_handles_labels()
-    assert {"spring", "pin", "slide", "tip", "ground", "link 1"} <= set(labels)
+    assert {"spring", "slide", "tip", "link 1"} <= set(labels)
     assert not named(ax, "spring 0")[0].get_label().startswith("spring")

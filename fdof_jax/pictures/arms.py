@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
 from matplotlib.lines import Line2D
 from matplotlib.markers import MarkerStyle
 from matplotlib.path import Path
@@ -15,7 +16,7 @@ from ..base.known_values import in_numpy
 from ..forces.element import Forces
 from ..linkage.frames import known_frames
 from ..linkage.linkage import Linkage, check_linkage, joints_of, without_fixed
-from .axes import BLACK, GREY, SERIES, Keywords, xy
+from .axes import ACCENT, BLACK, GREY, SERIES, Keywords, xy
 from .elements import ELEMENT_STYLES, element_lines, element_marker
 
 
@@ -85,9 +86,9 @@ def geometry(
             link.append(start[:, k + 1])  # across by the fixed B
         points[f"link {k}"] = np.column_stack(link)
     points[f"link {last}"] = np.column_stack([start[:, last], end[:, last]])
-    points[f"tip {last}"] = end[:, last:]
-    for k in range(last):  # after the tip, where a mass centre may be
+    for k in range(last):  # before the tip and pins, where a mass centre may be
         points[f"mass {k + 1}"] = np.column_stack([foot[:, k], center[:, k]])
+    points[f"tip {last}"] = end[:, last:]
     for k, kind in enumerate(kinds):
         if kind != "F":
             name = "pin" if kind == "R" else "slider"
@@ -98,8 +99,12 @@ def geometry(
     return g._replace(points=element_lines(linkage, forces, f, ts, g.extent) | points)
 
 
+# Cool colours first, among which the tip's path stands out.
+_LINKS = [SERIES[k] for k in (0, 5, 2, 3, 4)]
+
+
 def link_color(link: int) -> str:
-    return SERIES[(link - 1) % len(SERIES)] if link else BLACK
+    return _LINKS[(link - 1) % len(_LINKS)] if link else BLACK
 
 
 # Markers, in points: a carriage on a piece of its rail, a bearing on hatched ground.
@@ -113,16 +118,18 @@ _BEARING = Path(
 )
 
 _STYLES: dict[str, Keywords] = {
-    "link": dict(lw=2.2, solid_capstyle="round", solid_joinstyle="round"),
+    "link": dict(lw=3, solid_capstyle="round", solid_joinstyle="round"),
     "rail": dict(lw=0.9),
-    "mass": dict(lw=0.6, marker="o", ms=5, mec="white", mew=0.8, markevery=[1]),
-    "pin": dict(color=BLACK, marker="o", markersize=4.5, mfc="white"),
+    "mass": dict(lw=1, marker="o", ms=7, mec="white", mew=1, markevery=[1]),
+    "pin": dict(color=BLACK, marker="o", mfc="white"),
     "slider": dict(markersize=15, mfc="white", mew=0.9),
-    "tip": dict(marker="s", markersize=5),
+    "tip": dict(color=ACCENT, marker="o", ms=5),
 } | ELEMENT_STYLES
+_LABELS = {"mass": "mass centre", "slider": "slide", "rail": None, "pin": None}
 # In a legend, where a carriage is level, and a line would not show an element.
 _SYMBOLS: dict[str, Keywords] = {
-    "slider": dict(marker=_CARRIAGE) | _STYLES["slider"]
+    "slider": dict(marker=_CARRIAGE) | _STYLES["slider"],
+    "mass": dict(marker="o", ms=7, color=GREY),
 } | {
     kind: dict(marker=element_marker(kind), markersize=13, mfc="none", mew=style["lw"])
     for kind, style in ELEMENT_STYLES.items()
@@ -146,26 +153,34 @@ def draw_arm(
     mass_centers: bool,
     alpha: float = 1.0,
     color: ColorType | None = None,
-    label: bool = True,
+    bare: bool = False,
 ) -> dict[str, Line2D]:
-    """Draws sample `i` and returns its lines by name; the name is also the `gid`."""
+    """Draws sample `i` and returns its lines by name; the name is also the `gid`.
+
+    If it is `bare`, only links and rails are drawn, without labels, and `alpha` mixes
+    their colours with white, so that nothing shines through where they overlap.
+    """
     lines, labels = {}, set()
     for name, points in g.points.items():
         kind, number = name.split()
         if kind == "mass" and not mass_centers:
             continue
+        if bare and kind not in ("link", "rail"):
+            continue
         # A joint's rail and carriage belong to the link before it.
         link = int(number) - (kind in ("rail", "slider"))
-        (line,) = ax.plot(*xy(points[i]), alpha=alpha, gid=name, color=link_color(link))
+        (line,) = ax.plot(*xy(points[i]), gid=name, color=link_color(link))
         line.set(**_STYLES[kind])
-        if color is not None:
-            line.set_color(color)
+        if bare:
+            faded = 1 - alpha * (1 - np.array(to_rgb(link_color(link))))
+            line.set(color=faded, lw=min(2, line.get_linewidth()))
+        else:
+            line.set(color=color or line.get_color(), alpha=alpha)
         lines[name] = line
-        names = {"link": name, "mass": "mass centre", "slider": "slide", "rail": None}
-        text = names.get(kind, kind)
+        text = name if kind == "link" else _LABELS.get(kind, kind)
         if name == "link 0":
             line.set_linewidth(1.2)
-        elif label and text and text not in labels:
+        elif not bare and text and text not in labels:
             labels.add(text)
             if kind in _SYMBOLS:
                 (line,) = ax.plot([], [], ls="", color=line.get_color())
@@ -176,8 +191,8 @@ def draw_arm(
 
 
 def draw_ground(ax: Axes) -> None:
-    ground = ax.plot(0, 0, marker=_BEARING, markersize=18, zorder=1, gid="ground")[0]
-    ground.set(mfc="white", mec=GREY, mew=0.8, clip_on=False, ls="", label="ground")
+    ground = ax.plot(0, 0, marker=_BEARING, markersize=18, gid="ground")[0]
+    ground.set(mfc="white", mec=GREY, mew=0.8, clip_on=False, ls="")
 
 
 class DrawnMotion(NamedTuple):
@@ -201,11 +216,14 @@ def draw_motion(
     ax: Axes, g: Geometry, indices: np.ndarray, mass_centers: bool
 ) -> DrawnMotion:
     """Draws the samples `indices` from faint to full, and the tip's path up to them."""
-    draw_ground(ax)
-    path = xy(g.tip[: indices[-1] + 1])
-    (line,) = ax.plot(*path, color=GREY, lw=1, label="tip path", gid="tip path")
+    faint = np.linspace(0.2, 0.7, len(indices) - 1)
     arms = [
-        draw_arm(ax, g, i, mass_centers, float(alpha), label=i == indices[-1])
-        for i, alpha in zip(indices, np.linspace(1, 0.15, len(indices))[::-1])
+        draw_arm(ax, g, i, mass_centers, alpha, bare=True)
+        for i, alpha in zip(indices, faint)
     ]
+    draw_ground(ax)
+    arms.append(draw_arm(ax, g, indices[-1], mass_centers))
+    path = xy(g.tip[: indices[-1] + 1])
+    (line,) = ax.plot(*path, color=ACCENT, label="tip", gid="tip path", zorder=3)
+    line.set(marker="o", ms=4, markevery=[*indices])
     return DrawnMotion(line, arms)

@@ -17,6 +17,8 @@ Keywords = dict[str, Any]  # of functions of matplotlib
 # Okabe and Ito's colours, distinct under the common kinds of colour blindness.
 BLACK, GREY, LIGHT_GREY = "#000000", "#808080", "#BBBBBB"
 SERIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+ACCENT = SERIES[1]  # of the tip, its path, and what happens to a motion
+WIDTH = 6.4  # of a new figure [inches]
 
 
 def reached(
@@ -48,7 +50,7 @@ def mark_end(axes: Iterable[Axes], solution: Solution, last: float) -> None:
     """Marks the last time reached, if a motion ended early, in axes over time."""
     if text := ending(solution):
         for ax in axes:
-            ax.axvline(last, color=SERIES[1], ls=":", lw=1.2, label=text, gid="end")
+            ax.axvline(last, color=ACCENT, ls=":", lw=1.2, label=text, gid="end")
             ax.set_xlim(right=float(solution.ts[-1]))
 
 
@@ -62,18 +64,19 @@ def filled_mapping(name: str, value: object, kind: str) -> Mapping:
 def figure_or_new(fig: Figure | None, width: float, height: float) -> Figure:
     """Returns `fig`, or a new figure of the given size [inches]."""
     if fig is None:
-        return plt.figure(figsize=(width, height), layout="constrained")
+        return plt.figure(figsize=(width, height), layout="compressed")
     if not isinstance(fig, Figure):
         raise refusal("fig", "a matplotlib Figure or None", fig)
     return fig
 
 
-def axes_or_new(ax: Axes | None, height: float) -> Axes:
-    """Returns `ax`, or the axes of a new figure of the given height [inches]."""
+def axes_or_new(ax: Axes | None, height: float, width: float = WIDTH) -> Axes:
+    """Returns `ax`, or the axes of a new figure of the given size [inches]."""
     if ax is None:
-        return figure_or_new(None, 3.5, height).subplots()
+        ax = figure_or_new(None, width, height).subplots()
     if not isinstance(ax, Axes):
         raise refusal("ax", "matplotlib Axes or None", ax)
+    ax.spines[["top", "right"]].set_visible(False)
     return ax
 
 
@@ -81,11 +84,14 @@ def time_panels(
     fig: Figure | None, height: float, ylabels: Sequence[str]
 ) -> tuple[Figure, list[Axes]]:
     """Stacks axes over time; a new figure has the given `height` [inches]."""
-    fig = figure_or_new(fig, 3.5, height)
+    fig = figure_or_new(fig, WIDTH, height)
     axes = list(fig.subplots(len(ylabels), squeeze=False, sharex=True)[:, 0])
     for ax, ylabel in zip(axes, ylabels):
         ax.set_ylabel(ylabel)
+        ax.spines[["top", "right"]].set_visible(False)
+        ax.margins(x=0)
     axes[-1].set_xlabel("time [s]")
+    axes[-1].locator_params("x", nbins=6)
     fig.align_ylabels(axes)
     return fig, axes
 
@@ -95,23 +101,28 @@ def xy(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.real(points).ravel(), np.imag(points).ravel()
 
 
-def plane_axes(ax: Any, points: np.ndarray, *, beside: float = 0.0) -> Axes:
-    """Axes of equal scales; new axes get the proportions of the points.
+def plane_axes(
+    ax: Any, points: np.ndarray, *, width: float = WIDTH, beside: float = 0.0
+) -> Axes:
+    """Axes of equal scales; a new figure gets the proportions of the points.
 
-    `beside`: width to reserve beside the axes [inches].
+    `width`: of a new figure, of which `beside` is for a legend or a scale [inches].
     """
     corners = [part[~np.isnan(part)] for part in xy(points)]  # NaN lifts the pen
     low, high = (np.array([end(part) for part in corners]) for end in (np.min, np.max))
     # A straight arm has room around it.
     room = np.maximum(0.4 * max(*(high - low), 1e-9) - (high - low), 0) / 2
     low, high = low - room, high + room
-    width, height = high - low
-    ax = axes_or_new(ax, 0.9 + np.clip((2.9 - beside) * height / width, 1.6, 3.6))
+    across, up = high - low
+    inside = 1.1 * (width - beside - 0.7) * up / across
+    ax = axes_or_new(ax, 1.0 + np.clip(inside, 0.3 * width, 0.75 * width), width)
     ax.update_datalim([low, high])
     ax.set_aspect("equal")
     across, up = ax.margins()  # of what is drawn there
     ax.margins(max(across, 0.1), max(up, 0.16))  # below, the ground needs room
     ax.set(xlabel="x [m]", ylabel="y [m]")
+    ax.locator_params(steps=[1, 2, 5, 10])
+    ax.locator_params("y", nbins=6)  # as coarse as x
     return ax
 
 
@@ -130,26 +141,24 @@ def _entries(axes: Iterable[Axes]) -> dict[str, Artist]:
     return entries
 
 
-_LEGEND: Keywords = dict(fontsize="small", frameon=False, handlelength=1.2)
+_LEGEND: Keywords = dict(frameon=False, handlelength=1.2)
 
 
 def legend(ax: Axes, *others: Axes) -> None:
     """Adds a legend of all labels above the axes, where it hides nothing."""
     entries, figure = _entries((ax, *others)), figure_of(ax)
-    widest = max(len(line) for label in entries for line in label.splitlines())
-    columns = max(1, 48 // (4 + widest))
-    rows = -(-len(entries) // columns)
-    while True:
-        columns = -(-len(entries) // rows)  # makes rows of even length
+    figure.draw_without_rendering()  # with what was drawn since the last layout
+    for rows in range(1, len(entries) + 1):
         drawn = ax.legend(
-            entries.values(), entries.keys(), ncols=columns, columnspacing=1,
-            loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.2, **_LEGEND,
+            entries.values(), entries.keys(), ncols=-(-len(entries) // rows),
+            columnspacing=1.2, loc="lower left", bbox_to_anchor=(0, 1),
+            borderaxespad=0.2, **_LEGEND,
         )  # fmt: skip
         # Equal scales shrink the axes after a layout, so that one alone cuts labels.
         figure.draw_without_rendering()
-        if columns == 1 or drawn.get_window_extent().x1 <= figure.bbox.x1:
+        right = ax.get_position(original=True).x1 * figure.bbox.x1
+        if drawn.get_window_extent().x1 <= right:
             return
-        rows += 1
 
 
 def figure_legend(fig: Figure) -> None:

@@ -12,6 +12,7 @@ Malformed arguments raise ValueError. Curves over time are in `plotting`.
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
+from itertools import product
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -24,6 +25,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
+from matplotlib.transforms import Bbox
 from matplotlib.typing import ColorType
 from numpy.typing import ArrayLike
 from PIL import Image
@@ -37,6 +39,7 @@ from .axes import (
     BLACK,
     GREY,
     SERIES,
+    Keywords,
     ending,
     figure_legend,
     figure_of,
@@ -54,9 +57,10 @@ __all__ = [
 ]  # fmt: skip
 
 
-# Configurations with their time: so many, and so far apart, as a share of the picture.
-_MOST_TIMES, _APART = 5, 0.15
-_AHEAD = 13  # of the tip [points]
+_LEADER: Keywords = dict(arrowstyle="-", lw=0.8, shrinkA=0, shrinkB=5)
+# About so many configurations have their time, at the first of these angles [rad] from
+# their last link at which nothing lies below.
+_TIMES, _TURNS = 5, np.pi / 6 * np.array([0, 1, -1, 2, -2, 3, -3, 4, -4, 5, -5, 6])
 
 
 def __dir__() -> list[str]:
@@ -77,8 +81,8 @@ def draw_linkage(
 
     A link is a line along its vector A, bent by the fixed B where the next joint is
     revolute. Real revolute joints are pins; real prismatic joints are carriages on a
-    rail of length B. Fictitious joints are not drawn. The tip is a square. A mass
-    centre is a dot, joined to its link if it lies beside it.
+    rail of length B. Fictitious joints are not drawn. The tip is an orange dot. A mass
+    centre is a dot in its link's colour, joined to the link if it lies beside it.
 
     Of the force elements, those with a place are drawn: springs, dampers, cables (which
     hang if slack), bumpers, cylinders, wrenches as arrows, payloads as boxes while they
@@ -94,7 +98,8 @@ def draw_linkage(
 
     **Returns:** the axes. The `gid` of a line names its part: "link 1", "pin 1",
     "rail 2", "slider 2", "mass 3", "tip 3", "ground"; of an element, its kind and its
-    index: "spring 0", "cylinder 1". New axes have a legend of the parts above them.
+    index: "spring 0", "cylinder 1". New axes have a legend above them, without pins and
+    ground.
     """
     check_linkage(linkage)
     instance("mass_centers", mass_centers, bool)
@@ -119,12 +124,13 @@ def chrono_cyclograph(
 ) -> Axes:
     """Draws configurations at equal time steps, from faint to full, and the tip's path.
 
-    The picture is that of the paper's Figs 3, 5 and 7. A few configurations have their
-    time beside the tip.
+    The picture is that of the paper's Figs 3, 5 and 7. The last configuration has all
+    its parts, the others only links and rails. A dot on the path marks each step, and a
+    few dots have their time, where it hides nothing.
 
     **Arguments:** `every`: time step [s], at which the nearest samples are drawn;
     `until`: last time, by default the solution's [s]; `mass_centers`: whether to draw
-    them.
+    those of the last configuration.
 
     **Raises:** ValueError for malformed arguments and for an `until` before the start.
     """
@@ -136,32 +142,44 @@ def chrono_cyclograph(
     # The added 1e-6 keeps the last step if the division falls short by rounding.
     steps = np.arange(np.floor((last - ts[0]) / step + 1e-6) + 1)
     indices = np.unique([np.abs(ts - t).argmin() for t in ts[0] + step * steps])
-    ax = plane_axes(ax, g.all_points[: indices[-1] + 1])
+    end = indices[-1]  # which alone has mass centres
+    shown = [
+        part[end if name.startswith("mass") else 0 : end + 1]
+        for name, part in g.points.items()
+    ]
+    ax = plane_axes(ax, np.concatenate(shown, axis=None))
+    ax.margins(0.13, 0.16)  # for the times
     draw_motion(ax, g, indices, mass_centers)
-    _write_times(ax, ts, g, indices)
     if text := ending(solution):
         ax.plot([], [], " ", label=text)
     legend(ax)
+    _write_times(ax, ts, g, indices)
     return ax
 
 
 def _write_times(ax: Axes, ts: np.ndarray, g: Geometry, indices: np.ndarray) -> None:
-    """Writes its time beside the tip of a few configurations that are apart."""
-    written: list[complex] = []
-    ax.margins(0.18, 0.2)  # for the times
-    for i in (indices[-1], *indices[:-1]):
-        if len(written) == _MOST_TIMES:
-            return
-        tip = complex(g.tip[i])
-        if all(abs(tip - other) > _APART * g.extent for other in written):
-            written.append(tip)
-            ahead = _AHEAD * np.exp(1j * g.angle[i, -1])  # of the last link
-            ax.annotate(
-                f"{ts[i]:.3g} s", (tip.real, tip.imag), (ahead.real, ahead.imag),
-                textcoords="offset points", fontsize="small", ha="center",
-                va="center", gid="time", zorder=5,
-                path_effects=[withStroke(linewidth=3, foreground="white")],
-            )  # fmt: skip
+    """Writes times beside tips, from the last one, where nothing else is drawn."""
+    point = figure_of(ax).dpi / 72
+    drawn = [line.get_path().transformed(ax.transData) for line in ax.lines]
+    boxes: list[Bbox] = []
+    for i in indices[:: -max(1, len(indices) // _TIMES)]:
+        tip = np.ravel(xy(g.tip[i]))
+        at = ax.transData.transform(tip)
+        for far, turn in product((1, 1.8) if i == indices[-1] else (1,), _TURNS):
+            way = np.exp(1j * (g.angle[i, -1] + turn))  # ahead of the last link first
+            away = 24 * far * way.real, 15 * far * way.imag  # from the tip [points]
+            box = Bbox(at + point * (np.array(away) + [[-18, -8], [18, 8]]))
+            inside = ax.bbox.contains(*box.min) and ax.bbox.contains(*box.max)
+            hit = any(path.intersects_bbox(box, filled=False) for path in drawn)
+            if inside and not hit and not box.count_overlaps(boxes):
+                boxes.append(box)
+                ax.annotate(
+                    f"{ts[i]:.3g} s", tuple(tip), away, ha="center",
+                    va="center", textcoords="offset points", gid="time", zorder=5,
+                    arrowprops=_LEADER if far > 1 else None,
+                    path_effects=[withStroke(linewidth=3, foreground="white")],
+                )  # fmt: skip
+                break
 
 
 def _last(ts: np.ndarray, until: float | None) -> float:
@@ -215,7 +233,7 @@ def animate(
     twice as fast.
 
     **Returns:** the animation; a notebook plays it if it is the last line of a cell.
-    In a new figure a legend names every mark. Keep the animation until it is shown.
+    In a new figure a legend names the parts. Keep the animation until it is shown.
     `.save("motion.gif")` and `.save("motion.mp4")` write it with a progress bar, the
     latter with ffmpeg. For a web page there is `fj.view`.
     """
@@ -224,9 +242,7 @@ def animate(
     ts, q = ts[shown], q[shown]
     times, pause = _frame_times([ts], fps, speed, max_frames)
     g = geometry(linkage, q, ts, forces)
-    panel = plane_axes(ax, g.all_points)
-    if ax is None:
-        figure_of(panel).set_figwidth(4.8)  # the legend stands beside
+    panel = plane_axes(ax, g.all_points, width=4.8, beside=1.3)
     return _animation([panel], [(ts, g)], times, pause, panel.set_title, ax is None)
 
 
@@ -285,7 +301,7 @@ def _panels(
     points = np.concatenate([g.tip for _, g in geometries.values()])
     width, height = map(np.ptp, xy(points))
     high = np.clip(height / max(width, 1e-9), 0.4, 1.6)
-    fig = figure_or_new(fig, 1.3 + 1.75 * columns, 0.6 + (0.5 + 1.5 * high) * rows)
+    fig = figure_or_new(fig, 1.3 + 2 * columns, 0.6 + (0.6 + 1.8 * high) * rows)
     panels = []
     for position, title in enumerate(geometries):
         first = panels[0] if panels else None
@@ -294,9 +310,7 @@ def _panels(
         ax.set_title(fill(title, 18), fontsize="medium")  # no wider than its panel
         ax.set(xlabel="", ylabel="")
         ax.tick_params(
-            labelsize="small",
-            labelbottom=position + columns >= count,
-            labelleft=position % columns == 0,
+            labelbottom=position + columns >= count, labelleft=position % columns == 0
         )
         panels.append(ax)
     fig.supxlabel("x [m]", fontsize="medium")

@@ -12,6 +12,7 @@ import jax
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from ..base.checks import instance
 from ..control.drives import controller_in
@@ -22,10 +23,12 @@ from ..simulation.efforts import joint_efforts
 from ..simulation.solution import Solution
 from .arms import geometry, link_color
 from .axes import (
+    ACCENT,
     BLACK,
     GREY,
     LIGHT_GREY,
     SERIES,
+    WIDTH,
     axes_or_new,
     figure_or_new,
     legend,
@@ -87,23 +90,25 @@ def motion_profile(
         angle = geometry(linkage, q).angle[:, k + 1] if absolute else q[:, k]
         return np.rad2deg(angle)
 
-    angle = "absolute angle\n[degrees]" if absolute else "angle [degrees]"
+    angle = "absolute angle [degrees]" if absolute else "angle [degrees]"
     ylabels = {"R": angle, "P": "slide [m]"}
     panels = {kind: label for kind, label in ylabels.items() if kind in kinds}
-    fig, axes = time_panels(fig, 0.6 + 1.9 * len(panels), [*panels.values()])
+    fig, axes = time_panels(fig, 0.8 + 2.4 * len(panels), [*panels.values()])
     for ax, kind in zip(axes, panels):
+        if kind == "R":
+            ax.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 1.5, 3, 4.5, 9, 10]))
         joints = [k for k, one in enumerate(kinds) if one == kind]
         for k in joints:
             label = rf"$\theta_{k + 1}$" if absolute and kind == "R" else names[k]
             color, curve = link_color(k + 1), shown(q, k)
-            ax.plot(ts, curve, color=color, lw=1.2, label=label)
+            ax.plot(ts, curve, color=color, label=label)
             for times, path in wanted:
-                ax.plot(times, shown(path, k), "--", color=color, lw=0.9, zorder=3)
+                ax.plot(times, shown(path, k), "--", color=color, lw=1, zorder=3)
             if held[:, k].any():
                 values = np.where(held[:, k], curve, np.nan)
                 ax.plot(ts, values, color=color, lw=4, alpha=0.5)
         if wanted:
-            ax.plot([], [], "--", color=GREY, lw=0.9, label="reference")
+            ax.plot([], [], "--", color=GREY, lw=1, label="reference")
         if held[:, joints].any():
             ax.plot([], [], color=GREY, lw=4, alpha=0.5, label="held")
     mark_end(axes, solution, ts[-1])
@@ -144,11 +149,11 @@ def energy_profile(
     fig, axes = time_panels(fig, 6.0, [f"{name} [J]" for name in quantities])
     for ax, of_links in zip(axes, (kinetic, potential)):
         for k, values in enumerate(of_links.T, start=1):
-            ax.plot(ts, values, color=link_color(k), lw=1.2, label=f"link {k}")
+            ax.plot(ts, values, color=link_color(k), label=f"link {k}")
     sums = kinetic.sum(axis=1), potential.sum(axis=1), (kinetic + potential).sum(axis=1)
     names = "kinetic", "potential", "total"
     for values, label, color in zip(sums, names, (*SERIES[3:5], BLACK)):
-        axes[2].plot(ts, values, color=color, lw=1.2, label=label)
+        axes[2].plot(ts, values, color=color, label=label)
     mark_end(axes, solution, ts[-1])
     legend(axes[0])
     legend(axes[2])
@@ -182,7 +187,7 @@ def energy_stack(
     colors = [*SERIES[3:5], LIGHT_GREY]
     ax.stackplot(ts, list(bands.values()), labels=list(bands), colors=colors)
     label = "start + put in" if driven else "at the start"
-    ax.plot(ts, line, "--", color=BLACK, lw=1.2, label=label)
+    ax.plot(ts, line, "--", color=BLACK, label=label)
     ax.set(xlabel="time [s]", ylabel="energy [J]", xlim=(ts[0], ts[-1]))
     mark_end([ax], solution, ts[-1])
     legend(ax)
@@ -211,7 +216,7 @@ def effort_profile(
     named = named or [("none", total)]
     busy = _busy(ts, np.stack([part for _, part in named]))
     columns = 1 if busy is None else 2
-    fig = figure_or_new(fig, [3.5, 6.4][columns - 1], 1.0 + 1.4 * len(moving))
+    fig = figure_or_new(fig, WIDTH, 1.0 + 1.4 * len(moving))
     table = fig.subplots(
         len(moving), columns, squeeze=False, sharex="col", sharey="row",
         width_ratios=[1, 1.4][-columns:],
@@ -226,15 +231,16 @@ def effort_profile(
         most = "".join(f"\nlimit ±{limit:g}" for limit, _ in own)
         row[0].set_ylabel(f"{joints[k]} [{unit}]{most}")
         for ax in row:
+            ax.spines[["top", "right"]].set_visible(False)
             for (name, part), color in zip(named, cycle((SERIES[0], *SERIES[2:]))):
-                (line,) = ax.plot(ts, part[:, k], color=color, lw=1.2, label=name)
+                (line,) = ax.plot(ts, part[:, k], color=color, label=name)
                 if held and part is parts[0]:
                     line.set_drawstyle("steps-post")
         low, high = row[-1].get_ylim()  # before the bands, which may be far wider
         for limit, effort in own:
             at = (np.abs(effort) >= limit) & (effort != 0)
             for ax in row:
-                dots = ax.plot(ts[at], effort[at], ".", color=SERIES[1], zorder=3)
+                dots = ax.plot(ts[at], effort[at], ".", color=ACCENT, zorder=3)
                 name = "saturated" if at.any() else None
                 dots[0].set(label=name, gid=f"saturated {k + 1}")
             if at.any():

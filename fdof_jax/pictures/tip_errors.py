@@ -20,7 +20,6 @@ from ..references.timing import Laps
 from ..simulation.solution import Solution
 from .arms import geometry
 from .axes import (
-    GREY,
     SERIES,
     axes_or_new,
     ending,
@@ -32,6 +31,7 @@ from .axes import (
 )  # fmt: skip
 from .elements import COMMANDED
 
+_TIPS = [SERIES[k] for k in (1, 3, 4, 0, 2, 5)]  # first those of no early link
 # Without the lightest colours, which are hard to see on white.
 _DARK_TO_LIGHT = ListedColormap(colormaps["plasma"](np.linspace(0, 0.85, 256)))
 
@@ -83,10 +83,10 @@ def tracking(
     solutions: Mapping[str, Solution],
     ax: Axes | None = None,
 ) -> Axes:
-    """Plots paths of the tip with the commanded path, dashed; crosses are the starts.
+    """Plots paths of the tip with the commanded path, dashed; dots are the starts.
 
-    Drawn into the axes of `chrono_cyclograph`, it adds the path of the paper's Fig 7,
-    in colours that no link has.
+    Drawn into the axes of `chrono_cyclograph`, it adds the commanded path of the
+    paper's Fig 7. Call the motion "tip" there, as the path is drawn already.
 
     **Arguments:** `task`: a `CircleTask` or a `TipTask`, whose `tip(t)` is the
     commanded tip position [m]; `solutions`: one curve per label.
@@ -96,17 +96,9 @@ def tracking(
     paths = {label: tip.path for label, tip in tips.items()}
     ax = plane_axes(ax, np.concatenate([longest, *paths.values()]))
     _draw_commanded(ax, task, ts, longest)
-    for line in [line for line in ax.lines if line.get_gid() == "tip path"]:
-        drawn = np.asarray(line.get_xydata()) @ [1, 1j]
-        if any(np.array_equal(path[: len(drawn)], drawn) for path in paths.values()):
-            line.remove()  # drawn again below
-    taken = {line.get_color() for line in ax.lines}
-    free = [color for color in SERIES if color not in taken] or SERIES
-    for (label, path), color in zip(paths.items(), cycle(free)):
-        ax.plot(*xy(path), color=color, lw=1.2, label=label)
-        ax.plot(*xy(path[:1]), "x", color=color, markersize=5)
-    # Not "start", which a motion may be called.
-    ax.plot([], [], "x", color=GREY, markersize=5, label="begins here")
+    for (label, path), color in zip(paths.items(), cycle(_TIPS)):
+        (line,) = ax.plot(*xy(path), color=color, label=label, zorder=3)
+        line.set(marker="o", ms=4, markevery=[0])
     legend(ax)
     return ax
 
@@ -156,9 +148,9 @@ def tracking_error(
     """
     tips = _tips(linkage, task, solutions)
     ax = axes_or_new(ax, 2.6)
-    for (label, tip), color in zip(tips.items(), cycle(SERIES)):
+    for (label, tip), color in zip(tips.items(), cycle(_TIPS)):
         error = np.abs(tip.path - tip.commanded)
-        ax.plot(tip.ts, error, color=color, lw=1.2, label=label)
+        ax.plot(tip.ts, error, color=color, label=label)
     ax.set(xlabel="time [s]", ylabel="tip error [m]")
     ax.set_ylim(bottom=0)
     legend(ax)
