@@ -51,7 +51,8 @@ def main(arguments: list[str] | None = None) -> None:
     matplotlib.use("agg")  # pictures are written, never shown
     configure(x64=True)
     for name, figure in _COMMANDS[options.command]():
-        figure.savefig(output / f"{name}.png", dpi=150)
+        figure.suptitle(_TITLES[name], x=0.01, ha="left", weight="bold", size="medium")
+        figure.savefig(output / f"{name}.png", dpi=250)
         plt.close(figure)
         print(output / f"{name}.png", flush=True)
     first = (output / f"{name}.png" for name in _FIRST[options.command])
@@ -70,8 +71,9 @@ def _figures() -> Iterator[tuple[str, Any]]:
     yield "fig6-energies", plotting.energy_profile(arm, motion)
     arm, _, (controller,), _ = scenes.fig7()
     motion = _motion(scenes.fig7())
-    axes = drawing.chrono_cyclograph(arm, motion, until=0.5)
+    _, axes = plt.subplots(figsize=(6.4, 4.4), layout="compressed")
     plotting.tracking(arm, controller.reference, {"tip": motion}, axes)
+    drawing.chrono_cyclograph(arm, motion, axes, every=0.25, until=0.5)
     yield "fig7", axes.figure
 
 
@@ -92,6 +94,15 @@ def _motion(scene: Scene) -> Solution:
     return simulate(scene, ts)
 
 
+_TITLES = {
+    "fig3": "A damped triple pendulum, released level, swings down",
+    "fig4": "Damping brings the triple pendulum to rest in a few swings",
+    "fig5": "An undamped triple pendulum swings through to the other side",
+    "fig6-angles": "The undamped links swing on, never twice alike",
+    "fig6-energies": "The links exchange energy; the total stays constant",
+    "fig7": "Under PD control the arm sags, and its tip follows the circle too low",
+    "topologies": "One arm falls in all seven topologies",
+}
 _COMMANDS = {"figures": _figures, "topologies": _topologies}
 _FIRST = {"figures": ("fig3", "fig7"), "topologies": ("topologies",)}
 
