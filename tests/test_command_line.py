@@ -3,14 +3,16 @@
 import os
 
 import pytest
+from PIL import Image
 
 import fdof_jax as fj
 from fdof_jax.__main__ import main
 
 
 def pictures(folder):
+    """Returns the names of pictures that are wide enough for a page."""
     files = folder.glob("*.png")
-    return sorted(path.name for path in files if path.stat().st_size > 5000)
+    return sorted(path.name for path in files if Image.open(path).width >= 1600)
 
 
 @pytest.mark.slow

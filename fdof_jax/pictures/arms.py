@@ -120,7 +120,7 @@ _BEARING = Path(
 _STYLES: dict[str, Keywords] = {
     "link": dict(lw=3, solid_capstyle="round", solid_joinstyle="round"),
     "rail": dict(lw=0.9),
-    "mass": dict(lw=1, marker="o", ms=7, mec="white", mew=1, markevery=[1]),
+    "mass": dict(lw=1, marker="o", ms=8, markevery=[1]),
     "pin": dict(color=BLACK, marker="o", mfc="white"),
     "slider": dict(markersize=15, mfc="white", mew=0.9),
     "tip": dict(color=ACCENT, marker="o", ms=5),
@@ -129,7 +129,7 @@ _LABELS = {"mass": "mass centre", "slider": "slide", "rail": None, "pin": None}
 # In a legend, where a carriage is level, and a line would not show an element.
 _SYMBOLS: dict[str, Keywords] = {
     "slider": dict(marker=_CARRIAGE) | _STYLES["slider"],
-    "mass": dict(marker="o", ms=7, color=GREY),
+    "mass": dict(marker="o", ms=8, color=GREY),
 } | {
     kind: dict(marker=element_marker(kind), markersize=13, mfc="none", mew=style["lw"])
     for kind, style in ELEMENT_STYLES.items()

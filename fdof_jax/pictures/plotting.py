@@ -115,7 +115,7 @@ def motion_profile(
     for ax in axes:
         legend(ax)
     if title is not None:
-        fig.suptitle(title)
+        fig.suptitle(title, fontsize="medium")
     return fig
 
 
