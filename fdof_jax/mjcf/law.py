@@ -18,6 +18,15 @@ from ..forces import (
 )
 
 
+def _limit(shape: tuple, unit: str) -> Any:
+    return field(shape, unit=unit, finite=False, default=None)
+
+
+def _alike(name: str, values: tuple) -> Condition:
+    sizes = tuple(len(value) for value in values if value is not None)
+    return Condition(len({*sizes}) == 1, name, "as many actuators in all fields", sizes)
+
+
 class Activation(Part):
     """States s of `Actuators`, one each: a lag, an integrator, a current.
 
@@ -44,18 +53,12 @@ class Activation(Part):
     gain: Values = field((None,), unit="N or N m per unit of the state")
     rate: Values = field((None, 4), unit="1/s and others")
     start: Values = field((None,), unit="that of the state")
-    lower: Values | None = field(
-        (None,), unit="that of the state", finite=False, default=None
-    )
-    upper: Values | None = field(
-        (None,), unit="that of the state", finite=False, default=None
-    )
+    lower: Values | None = _limit((None,), "that of the state")
+    upper: Values | None = _limit((None,), "that of the state")
 
     def conditions(self):
         values = self.gain, self.rate, self.start, self.lower, self.upper
-        sizes = [len(value) for value in values if value is not None]
-        alike = len(set(sizes)) == 1
-        yield Condition(alike, "gain", "as many actuators in all fields", tuple(sizes))
+        yield _alike("gain", values)
         yield from self.ordered("lower", "upper")
 
 
@@ -95,23 +98,17 @@ class Actuators(StatefulElement):
     gain: Values = field((None, 3), unit="N or N m per unit of the control")
     bias: Values = field((None, 3), unit="N or N m")
     control: Any = field((None,), unit="that of the actuator", function=True)
-    lower: Values | None = field((None,), unit="N or N m", finite=False, default=None)
-    upper: Values | None = field((None,), unit="N or N m", finite=False, default=None)
-    effort_lower: Values | None = field(
-        ("joint",), unit="N or N m", finite=False, default=None
-    )
-    effort_upper: Values | None = field(
-        ("joint",), unit="N or N m", finite=False, default=None
-    )
+    lower: Values | None = _limit((None,), "N or N m")
+    upper: Values | None = _limit((None,), "N or N m")
+    effort_lower: Values | None = _limit(("joint",), "N or N m")
+    effort_upper: Values | None = _limit(("joint",), "N or N m")
     activation: Activation | None = of_kind(Activation, default=None)
 
     def conditions(self):
         fixed = () if callable(self.control) else (self.control,)
         states = () if self.activation is None else (self.activation.gain,)
         values = self.gear, self.gain, self.bias, self.lower, self.upper
-        sizes = [len(v) for v in (*values, *fixed, *states) if v is not None]
-        alike = len(set(sizes)) == 1
-        yield Condition(alike, "gear", "as many actuators in all fields", tuple(sizes))
+        yield _alike("gear", (*values, *fixed, *states))
         yield from self.ordered("lower", "upper")
         yield from self.ordered("effort_lower", "effort_upper")
 

@@ -56,16 +56,15 @@ def to_mjcf(
     tip. Links are drawn, and nothing collides. Masses and moments of inertia below
     1e-15, in particular zero, become 1e-15, the smallest that MuJoCo accepts.
 
-    `JointDamper`, `JointSpring`, `Armature`, `JointEffort` (motors `effort1`, ...),
-    `SpringDamper` (a spatial tendon; one-sided ones without damping), `Actuators` and
-    `PDController` act as they do here. The latter becomes actuators `position1`,
-    `velocity1`, ..., whose sum the joint limits. The controls at time 0, those of a
-    reference for instance, are in the key frame `start`, which also has `state0`; set
-    `data.ctrl` as a moving reference demands. The model asks for MuJoCo's RK4 with
-    steps of 1 ms, as its own default, Euler with 2 ms, is far less exact. MuJoCo has
-    other models of stops and friction: of `JointStops` and `HardStops` it takes the
-    range alone and stops softly by its own `solref`; of `JointFriction` the level
-    alone, and joints that stick creep. `from_mjcf` reads all of it.
+    Elements act as they do here: a `JointEffort` as motors `effort1`, ..., a
+    `SpringDamper` as a spatial tendon, a `PDController` as `position1`, `velocity1`,
+    ..., whose sum the joint limits. The controls at time 0, those of a reference for
+    instance, are in the key frame `start`, which also has `state0`; set `data.ctrl` as
+    a moving reference demands. The model asks for MuJoCo's RK4 with steps of 1 ms, as
+    its own default, Euler with 2 ms, is far less exact. MuJoCo has other models of
+    stops and friction: of `JointStops` and `HardStops` it takes the range alone and
+    stops softly by its own `solref`; of `JointFriction` the level alone, and joints
+    that stick creep. `from_mjcf` reads all of it.
 
     **Arguments:** `linkage`: one linkage with concrete values; `forces`: elements;
     `state0`: the start. Or a scene, which holds all of them.
@@ -150,10 +149,7 @@ def _check_elements(
             others = [e for e in acting if e is not element and type(e) in _ACTUATORS]
             limits, _ = _limits_and_acts(element, linkage)
             if any((limits & _limits_and_acts(e, linkage)[1]).any() for e in others):
-                expected = (
-                    "no limit of efforts in a joint with other actuators, as a joint "
-                    "of MuJoCo limits their sum"
-                )
+                expected = "no limit of efforts beside others, as MuJoCo limits a sum"
         if expected:
             raise ValueError(f"forces[{k}]: expected {expected}, got {name}.")
 
@@ -174,10 +170,7 @@ def _limits_and_acts(element: Any, linkage: Linkage) -> tuple[np.ndarray, np.nda
 def _draw(
     root: Node, bodies: list[Node], kinds: str, length: np.ndarray, locked: np.ndarray
 ) -> None:
-    """Capsules along the links, and lines along the slides, seen from above.
-
-    They neither weigh nor collide.
-    """
+    """Capsules along links and lines along slides, that neither weigh nor collide."""
     add = ElementTree.SubElement
     visual = add(root, "visual")
     add(visual, "global", azimuth="90", elevation="-90")
@@ -188,12 +181,11 @@ def _draw(
     # A link ends where the next hinge is, or where the next slide begins.
     sides = [locked[k] if kind == "R" else 0.0 for k, kind in enumerate(kinds)]
     for k, (end, side) in enumerate(zip(length, [*sides, 0.0])):
-        own = dict(type="sphere")
+        own = dict(contype="0", conaffinity="0", mass="0", group="1")
+        own |= dict(type="sphere", size=_text(size), rgba=_COLOURS[k % 2])
         if abs(end) + abs(side) > 0:
-            own = dict(type="capsule", fromto=_text(0, 0, 0, end, side, 0))
-        free = dict(contype="0", conaffinity="0", mass="0", group="1")
-        free |= dict(size=_text(size), rgba=_COLOURS[k % 2])
-        add(bodies[k], "geom", own | free)
+            own |= dict(type="capsule", fromto=_text(0, 0, 0, end, side, 0))
+        add(bodies[k], "geom", own)
         if k < len(kinds) and kinds[k] == "P":
             ends = (bodies[k], end, side), (bodies[k + 1], 0, 0)
             line = dict(name=f"slide{k + 1}", width=_text(size / 3))
@@ -237,11 +229,11 @@ def _of_joints(acting: tuple[Element, ...], linkage: Linkage) -> list[dict[str, 
             add("range", low, high, where=bounded)
         elif isinstance(element, PDController):
             bounded, _ = _limits_and_acts(element, linkage)
-            limit = element.limit
-            add("actuatorfrcrange", -limit, limit, where=bounded)
+            add("actuatorfrcrange", -element.limit, element.limit, where=bounded)
         elif isinstance(element, Actuators):
-            lower, upper = element.effort_lower, element.effort_upper
-            low, high, bounded = _ends(lower, upper, count)
+            low, high, bounded = _ends(
+                element.effort_lower, element.effort_upper, count
+            )
             add("actuatorfrcrange", low, high, where=bounded)
     return joints
 
@@ -276,63 +268,51 @@ def _add_actuators(
     """Adds actuators; returns their controls and states at time 0."""
     controls: list[float] = []
     states: list[float] = []
-    count, uses = len(kinds), Counter[str]()
+    uses = Counter[str]()
 
     def unique(name: str) -> str:
         uses[name] += 1
         return name if uses[name] == 1 else f"{name}_{uses[name]}"
 
-    def add(
-        kind: str, name: str, joint: int, control: Number, **values: Number
-    ) -> None:
-        own = dict(name=unique(name), joint=f"joint{joint + 1}")
-        texts = {key: _text(value) for key, value in values.items()}
-        ElementTree.SubElement(child(root, "actuator"), kind, own | texts)
+    def add(kind: str, name: str, control: Number, **own: str) -> None:
+        own = dict(name=unique(name)) | own
+        ElementTree.SubElement(child(root, "actuator"), kind, own)
         controls.append(float(control))
 
     for place, element in enumerate(acting):
         if isinstance(element, JointEffort):
-            limited = np.zeros(count, bool)
-            for other in acting:
-                if isinstance(other, _ACTUATORS):
-                    limited |= _limits_and_acts(other, linkage)[0]
+            drives = [each for each in acting if isinstance(each, _ACTUATORS)]
+            limits = [_limits_and_acts(each, linkage)[0] for each in drives]
             for k, tau in enumerate(np.asarray(element.tau)):
-                if kinds[k] != "F" and not (limited[k] and tau == 0):
-                    add("motor", f"effort{k + 1}", k, tau)
+                if kinds[k] != "F" and not (np.any(limits, axis=0)[k] and tau == 0):
+                    add("motor", f"effort{k + 1}", tau, joint=f"joint{k + 1}")
         elif isinstance(element, PDController):
             target, velocity = element.schedule(jnp.zeros(()), linkage)
             rows = zip(*map(np.asarray, (element.kp, element.kd, element.limit)))
             for k, (kp, kd, limit) in enumerate(rows):
                 if kinds[k] != "F" and limit != 0:
-                    add("position", f"position{k + 1}", k, target[k], kp=kp)
-                    add("velocity", f"velocity{k + 1}", k, velocity[k], kv=kd)
+                    on: Any = dict(joint=f"joint{k + 1}")
+                    add("position", f"position{k + 1}", target[k], **on, kp=_text(kp))
+                    add("velocity", f"velocity{k + 1}", velocity[k], **on, kv=_text(kd))
         elif isinstance(element, Actuators):
             laws = _general(element, f"forces[{place}]", linkage)
-            for number, (gear, attributes, control, start) in enumerate(laws):
-                own = dict(name=unique(f"actuator{number + 1}"))
+            for number, (gear, attributes, control, start) in enumerate(laws, start=1):
                 ratios = {k: gear[k] for k in np.flatnonzero(gear) if kinds[k] != "F"}
-                if not ratios:
-                    continue
                 if len(ratios) == 1:
                     ((k, ratio),) = ratios.items()
-                    own |= dict(joint=f"joint{k + 1}", gear=_text(ratio))
-                else:
-                    name = unique(f"gear{number + 1}")
-                    own |= dict(tendon=_tendon(root, name, ratios))
-                own |= attributes
-                ElementTree.SubElement(child(root, "actuator"), "general", own)
-                controls.append(control)
-                states += start
+                    attributes |= dict(joint=f"joint{k + 1}", gear=_text(ratio))
+                elif ratios:
+                    # A tendon's length is a sum of joint positions.
+                    own = dict(name=unique(f"gear{number}"))
+                    tendon = ElementTree.SubElement(child(root, "tendon"), "fixed", own)
+                    for k, ratio in ratios.items():
+                        part = dict(joint=f"joint{k + 1}", coef=_text(ratio))
+                        ElementTree.SubElement(tendon, "joint", part)
+                    attributes |= dict(tendon=own["name"])
+                if ratios:
+                    add("general", f"actuator{number}", control, **attributes)
+                    states += start
     return controls, states
-
-
-def _tendon(root: Node, name: str, ratios: dict[Any, float]) -> str:
-    """Adds a tendon whose length is a sum of joint positions; returns its name."""
-    tendon = ElementTree.SubElement(child(root, "tendon"), "fixed", name=name)
-    for k, ratio in ratios.items():
-        own = dict(joint=f"joint{k + 1}", coef=_text(ratio))
-        ElementTree.SubElement(tendon, "joint", own)
-    return name
 
 
 def _general(
@@ -344,28 +324,25 @@ def _general(
     low, high, bounded = _ends(element.lower, element.upper, len(gears))
     own = element.activation
     for k, gear in enumerate(gears):
-        gain, law, attributes = gains[k], bias[k].copy(), {}
-        start: list[float] = []
+        gain, law, attributes, start = gains[k], bias[k].copy(), {}, []
         if bounded[k]:
             ends = _text(low[k], high[k])
             attributes |= dict(forcelimited="true", forcerange=ends)
         if own is not None and not np.any(np.asarray(own.rate)[k]):
             law[0] += float(own.gain[k] * own.start[k])  # a state that stays
         elif own is not None:
-            rate, time = np.asarray(own.rate)[k], 0.0
-            if rate[1] < 0:
-                time = -1 / rate[1]
-            kind = "filterexact" if time else "integrator"
-            expected = [1 / time, -1 / time, 0, 0] if time else [1, 0, 0, 0]
-            if gain.any() or (rate != expected).any():
+            rate = np.asarray(own.rate)[k]
+            lag = -rate[1] if rate[1] < 0 else 0.0
+            if gain.any() or (rate != [lag or 1, -lag, 0, 0]).any():
                 raise ValueError(
                     f"{place}: expected states that follow or integrate their control, "
                     f"as MuJoCo's general actuators have them, got {rate.tolist()}."
                 )
             gain = [float(np.asarray(own.gain)[k]), 0.0, 0.0]
             start = [float(np.asarray(own.start)[k])]
-            attributes |= dict(dyntype=kind)
-            attributes |= dict(dynprm=_text(time)) if time else {}
+            attributes |= dict(dyntype="integrator")
+            if lag:
+                attributes |= dict(dyntype="filterexact", dynprm=_text(1 / lag))
             bottom, top, within = _ends(own.lower, own.upper, len(gears))
             if within[k]:
                 ends = _text(bottom[k], top[k])
