@@ -537,11 +537,11 @@ refuse("nothing but a marker", "without joints", mjcf(
 refuse("endless gravity", "finite gravity", arm(head='<option gravity="0 0 nan"/>'))
 refuse("start that is no number", "a finite start", arm(
     tail='<keyframe><key qpos="nan 0"/></keyframe>'))
-refuse("another document", "without joints", '<!DOCTYPE mujoco ['
+refuse("another document", "in XML without entities", '<!DOCTYPE mujoco ['
     '<!ENTITY a "><mujoco><include file=\'/etc/hostname\'/></mujoco><!--"> ]>'
     "<mujoco/><!-- -->")
-refuse("deep robot", "nested too deep", "<robot>" + 20000 * "<a>" +
-    20000 * "</a>" + "</robot>")
+refuse("deep robot", "nested too deep", "<robot>" + 20000 * "<mujoco>" +
+    20000 * "</mujoco>" + "</robot>")
 refuse("slide across", "the axis of joint elbow in the plane",
     arm(second='type="slide"'))
 refuse("contact at the start", "with a contact", arm(

@@ -1,7 +1,6 @@
 """Actuators of a MuJoCo model: their laws, and the elements that act alike."""
 
-from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,24 +31,18 @@ class _OwnState(NamedTuple):
     upper: float = np.inf
 
 
-class _Law(NamedTuple):
+class _Row(NamedTuple):
+    """An actuator, in the terms of `Actuators`: its law, and where it acts."""
+
     gain: _Affine
     bias: _Affine
     state: _OwnState | None = None
-
-
-class _Row(NamedTuple):
-    """An actuator, in the terms of `Actuators`."""
-
-    name: str
-    gear: np.ndarray  # (n,)
-    control: float
-    lower: float
-    upper: float
-    gain: _Affine
-    bias: _Affine
-    state: _OwnState | None
-    control_range: np.ndarray | None
+    name: str = ""
+    gear: np.ndarray = np.zeros(0)  # (n,)
+    control: float = 0.0
+    lower: float = -np.inf
+    upper: float = np.inf
+    control_range: np.ndarray | None = None
 
 
 def _gear(read: Reader, chain: Chain, actuator: int) -> np.ndarray | None:
@@ -57,41 +50,41 @@ def _gear(read: Reader, chain: Chain, actuator: int) -> np.ndarray | None:
     model, kinds = read.model, read.mujoco.mjtTrn
     target = model.actuator_trnid[actuator, 0]
     kind = kinds(int(model.actuator_trntype[actuator]))
-    coefficients = np.zeros(model.njnt)
     if kind in (kinds.mjTRN_JOINT, kinds.mjTRN_JOINTINPARENT):
-        coefficients[target] = 1
-    elif kind == kinds.mjTRN_TENDON:
-        wraps = read.path_of_tendon(target)
-        if (model.wrap_type[wraps] != int(read.mujoco.mjtWrap.mjWRAP_JOINT)).any():
-            return None
-        np.add.at(coefficients, model.wrap_objid[wraps], model.wrap_prm[wraps])
-    else:
+        gear = chain.signs * (chain.joints == target)
+    elif kind != kinds.mjTRN_TENDON or (gear := sum_of(read, chain, target)) is None:
         return None
-    beside = np.delete(coefficients, chain.joints)
+    return gear * model.actuator_gear[actuator, 0]
+
+
+def sum_of(read: Reader, chain: Chain, tendon: int) -> np.ndarray | None:
+    """Ratios of a fixed tendon's length to q; None if others have a part in it."""
+    model, wraps = read.model, read.path_of_tendon(tendon)
+    if (model.wrap_type[wraps] != int(read.mujoco.mjtWrap.mjWRAP_JOINT)).any():
+        return None
+    coefficients = np.zeros(model.njnt)
+    np.add.at(coefficients, model.wrap_objid[wraps], model.wrap_prm[wraps])
     here = coefficients[chain.joints] * chain.signs
-    if here.any() and beside.any():
-        return None
-    return here * model.actuator_gear[actuator, 0]
+    return None if here.any() and np.delete(coefficients, chain.joints).any() else here
 
 
-def inertias_of_actuators(
-    read: Reader, chain: Chain
-) -> Iterator[tuple[np.ndarray, float, float]]:
-    """Yields gears, damping and armature of actuators, in newer versions."""
-    model = read.model
+def inertias_of_actuators(read: Reader, chain: Chain) -> np.ndarray:
+    """Damping and armature that actuators of newer versions add to joints, (2, n)."""
+    model, sums = read.model, np.zeros((2, len(chain.joints)))
     if "actuators" in read.drop or not hasattr(model, "actuator_armature"):
-        return
+        return sums
     for actuator in range(len(model.actuator_trntype)):
         values = model.actuator_damping[actuator], model.actuator_armature[actuator]
         bent = read.has("actuator_dampingpoly", actuator)
         if not any(values) and not bent:
             continue
-        name = f"actuator {read.name_of('actuator', actuator)}"
         gear = _gear(read, chain, actuator)
         if bent or gear is None or np.count_nonzero(gear) > 1:
+            name = f"actuator {read.name_of('actuator', actuator)}"
             read.leave("actuators", name, "damping or armature that joints do not have")
         else:
-            yield gear, *values
+            sums += np.outer(values, gear**2)
+    return sums
 
 
 def actuators(read: Reader, chain: Chain, controls: ArrayLike | None) -> list[Element]:
@@ -112,30 +105,24 @@ def actuators(read: Reader, chain: Chain, controls: ArrayLike | None) -> list[El
         off = 0 <= group < 31 and model.opt.disableactuator & (1 << group)
         if off or read.disabled("ACTUATION"):
             read.note(name, "left out, switched off")
-            continue
-        if "actuators" in read.drop:
+        elif "actuators" in read.drop:
             read.note(name, "left out, as asked")
-            continue
-        gear = _gear(read, chain, actuator)
-        if gear is None:
+        elif (gear := _gear(read, chain, actuator)) is None:
             kind = read.mujoco.mjtTrn(int(model.actuator_trntype[actuator]))
             what = f"a transmission ({kind.name[6:].lower()}) beyond the chain's joints"
             read.leave("actuators", name, what)
         elif not gear.any():
             read.note(name, "left out, as it acts on nothing of the chain")
+        elif isinstance(law := _law(read, actuator, controls, states), str):
+            read.leave("actuators", name, law)
+        elif not any(law.gain) and not any(law.bias) and law.state is None:
+            read.note(name, "left out, as its gains are 0")
         else:
-            law = _law(read, actuator, controls, states)
-            if isinstance(law, str):
-                read.leave("actuators", name, law)
-                continue
-            if not any(law.gain) and not any(law.bias) and law.state is None:
-                read.note(name, "left out, as its gains are 0")
-                continue
             lower, upper = map(float, read.bounds("actuator_force", actuator))
             place = _places(model, actuator)[0]
             within = ranges[place] if clamped[place] else None
-            control = float(controls[place])
-            rows.append(_Row(name, gear, control, lower, upper, *law, within))
+            own = name, gear, float(controls[place]), lower, upper, within
+            rows.append(_Row(*law[:3], *own))
     lower, upper = read.bounds("jnt_actfrc", chain.joints, chain.signs)
     if not rows:
         return []
@@ -165,7 +152,7 @@ def _places(model: Model, actuator: int) -> range:
 
 def _law(
     read: Reader, actuator: int, controls: np.ndarray, states: np.ndarray
-) -> _Law | str:
+) -> _Row | str:
     """The law of an actuator, or what it has that `Actuators` do not."""
     model, mujoco = read.model, read.mujoco
     kind = lambda names, value: names(int(value)).name.rpartition("_")[2]
@@ -187,14 +174,14 @@ def _law(
     bias = _Affine(*biasprm[:3]) if bias_kind == "AFFINE" else _Affine()
     if gain_kind == "PID":
         given = [float(controls[k]) for k in _places(model, actuator)]
-        inputs = int(model.actuator_ctrlspec[actuator])
         own = state if dynamics == "PID" else None
+        inputs = int(model.actuator_ctrlspec[actuator])
         return _pid(dynprm, gainprm, bias, own, given, inputs)
     if gain_kind not in ("FIXED", "AFFINE") or bias_kind not in ("NONE", "AFFINE"):
         return f"a law of the kinds {gain_kind.lower()} and {bias_kind.lower()}"
     gain = _Affine(*gainprm[: 3 if gain_kind == "AFFINE" else 1])
     if dynamics == "NONE":
-        return _Law(gain, bias)
+        return _Row(gain, bias)
     if dynamics not in ("INTEGRATOR", "FILTER", "FILTEREXACT"):
         return f"dynamics of the kind {dynamics.lower()}"
     if any(gain[1:]):
@@ -202,13 +189,13 @@ def _law(
     rate = 1 / max(dynprm[0], 1e-15)
     rates = (1.0, 0.0) if dynamics == "INTEGRATOR" else (rate, -rate)
     own = state._replace(gain=gain.constant, rate=(*rates, 0.0, 0.0))
-    return _Law(_Affine(), bias, own)
+    return _Row(_Affine(), bias, own)
 
 
 def _pid(
     dynprm: list[float], gainprm: list[float], bias: _Affine, state: _OwnState | None,
     given: list[float], inputs: int,
-) -> _Law | str:  # fmt: skip
+) -> _Row | str:  # fmt: skip
     """A PID controller: its own state is the integral of the position's error."""
     limit, slew, *_ = dynprm
     if slew > 0:
@@ -218,7 +205,7 @@ def _pid(
         return "no position among the inputs of its controller"
     target = dict(zip([bit for bit in (1, 2, 4) if inputs & bit], given))
     known = -bias.speed * target.get(2, 0.0) + target.get(4, 0.0)
-    law = _Law(_Affine(-bias.length), bias._replace(constant=known))
+    law = _Row(_Affine(-bias.length), bias._replace(constant=known))
     if state is None:
         return law
     state = state._replace(gain=gainprm[0], rate=(1.0, 0.0, -1.0, 0.0))
@@ -229,7 +216,7 @@ def _pid(
 
 def _dc_motor(
     dynprm: list[float], gainprm: list[float], biasprm: list[float], state: _OwnState
-) -> _Law | str:
+) -> _Row | str:
     """A DC motor: with inductance, its own state is the current."""
     resistance, constant, *others = gainprm
     time, *more = dynprm  # of the winding [s]
@@ -237,14 +224,15 @@ def _dc_motor(
         return "a DC motor with more than winding, constant and inductance"
     if time == 0:
         drag = constant**2 / resistance
-        return _Law(_Affine(constant / resistance), _Affine(speed=-drag))
+        return _Row(_Affine(constant / resistance), _Affine(speed=-drag))
     inductance = time * resistance
     rate = 1 / inductance, -1 / time, 0.0, -constant / inductance
-    return _Law(_Affine(), _Affine(), state._replace(gain=constant, rate=rate))
+    return _Row(_Affine(), _Affine(), state._replace(gain=constant, rate=rate))
 
 
-def _column(rows: list[_Row], name: str) -> np.ndarray:
-    return np.array([getattr(row, name) for row in rows])
+def _columns(rows: list[_Row]) -> list[Any]:
+    names = "gear", "gain", "bias", "control", "lower", "upper"
+    return [np.array([getattr(row, name) for row in rows]) for name in names]
 
 
 def _general(rows: list[_Row], lower: np.ndarray, upper: np.ndarray) -> Actuators:
@@ -255,17 +243,9 @@ def _general(rows: list[_Row], lower: np.ndarray, upper: np.ndarray) -> Actuator
         gain, rate, start, low, high = zip(*states)
         ends = finite(np.array(low)), finite(np.array(high))
         activation = Activation(gain, rate, start, *ends)
-    return Actuators(
-        gear=_column(rows, "gear"),
-        gain=_column(rows, "gain"),
-        bias=_column(rows, "bias"),
-        control=_column(rows, "control"),
-        lower=finite(_column(rows, "lower")),
-        upper=finite(_column(rows, "upper")),
-        effort_lower=finite(lower),
-        effort_upper=finite(upper),
-        activation=activation,
-    )
+    values = _columns(rows)
+    values[4:] = map(finite, (*values[4:], lower, upper))
+    return Actuators(*values, activation=activation)
 
 
 def _simple(
@@ -275,8 +255,7 @@ def _simple(
 
     `lower`, `upper`: limits of the sum on each joint, which couple its actuators.
     """
-    columns = "gear", "gain", "bias", "control", "lower", "upper"
-    gear, gain, bias, control, low, high = (_column(rows, name) for name in columns)
+    gear, gain, bias, control, low, high = _columns(rows)
     on, servo = gear != 0, bias[:, 1:].any(axis=1)
     bounded = servo & np.isfinite([low, high]).any(axis=0)
     servos, motors, bounds = (on[who].sum(axis=0) for who in (servo, ~servo, bounded))

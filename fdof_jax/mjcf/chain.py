@@ -13,10 +13,11 @@ from .checks import plain, refusal
 from .source import Model
 
 Data = Any  # an `mujoco.MjData`
-_SLIDE, _HINGE = 2, 3  # MuJoCo's mjtJoint
+_SLIDE, _HINGE, _OF_JOINTS = 2, 3, 2  # of MuJoCo's mjtJoint and mjtEq
 FAR = 1e9  # stands for infinity where MuJoCo wants a number
 _EXACT = 1e-9  # what is as far out of the plane is taken for rounding
 _FLAT = 1e-5  # and what is as far [rad] is laid into the plane, with a remark
+_NOTHING = 1e-13  # MuJoCo's least masses and inertias, of 1e-15 per body, stand for 0
 _TIPS = ("tip", "ee", "tool", "hand", "end_effector")
 
 
@@ -24,8 +25,7 @@ class Chain(NamedTuple):
     """Where a model's chain is, and what its plane is.
 
     - `joints`: their ids; `names`, `places` (in qpos) and `rates` (in qvel), (n,).
-    - `links`: by body: 0 for the ground, 1, 2, ... for the link that it belongs to, -1
-      for what is beside the chain.
+    - `links`: by body: 0 for the ground, 1, 2, ... for its link, -1 beside the chain.
     - `signs`: (n,), -1 for hinges that turn against the first; q = signs * qpos.
     - `right`, `up`, `normal`: unit vectors; `gravity` [m/s^2] points against `up`.
     - `starts`: characteristic points of ground and links, (n + 1,); `turns`: angles
@@ -45,9 +45,9 @@ class Chain(NamedTuple):
     starts: np.ndarray
     turns: np.ndarray
 
-    def plane(self, vector: np.ndarray) -> complex:
-        """A vector's components to the right and upwards."""
-        return complex(vector @ self.right, vector @ self.up)
+    def plane(self, vectors: np.ndarray) -> Any:
+        """Components to the right and upwards of a vector, or of many."""
+        return vectors @ self.right + 1j * (vectors @ self.up)
 
 
 class Reader(NamedTuple):
@@ -77,7 +77,22 @@ class Reader(NamedTuple):
         data = self.mujoco.MjData(self.model)
         if self.model.nkey:
             self.mujoco.mj_resetDataKeyframe(self.model, data, 0)
+        for joint, place in self.locked().values():
+            data.qpos[self.model.jnt_qposadr[joint]] = place
         return data
+
+    def locked(self) -> dict[int, tuple[int, float]]:
+        """Joints that equalities hold, and where in qpos, by equality."""
+        model, held = self.model, {}
+        if "equalities" in self.drop or self.disabled("EQUALITY", "CONSTRAINT"):
+            return held
+        for index in np.flatnonzero(model.eq_active0):
+            follows = model.eq_obj2id[index] >= 0 and model.eq_data[index, 1:5].any()
+            if model.eq_type[index] == _OF_JOINTS and not follows:
+                joint = int(model.eq_obj1id[index])
+                rest = model.qpos0[model.jnt_qposadr[joint]]
+                held[int(index)] = joint, float(rest + model.eq_data[index, 0])
+        return held
 
     def path_of_tendon(self, tendon: int) -> slice:
         """Where the parts of a tendon's path are."""
@@ -166,8 +181,9 @@ def _joints_of_arm(read: Reader, tip: str | None) -> tuple[np.ndarray, np.ndarra
     """The joints of the arm, and the link of each body; notes chains beside it."""
     model, name = read.model, lambda body: read.name_of("body", body)
     welded, tree_of = model.body_weldid, model.body_treeid  # -1 of what stands still
+    refuse = lambda what: ValueError(f"source: expected a planar chain, got {what}.")
     if model.ntree == 0:
-        raise ValueError("source: expected a planar chain, got a model without joints.")
+        raise refuse("a model without joints")
     of_joint = tree_of[model.jnt_bodyid]
     if tip is not None:
         if (at := _named(read, tip)) is None:
@@ -193,7 +209,6 @@ def _joints_of_arm(read: Reader, tip: str | None) -> tuple[np.ndarray, np.ndarra
             first = np.argmax(tree_of == tree)
             read.note(f"chain of body {name(first)}", "left out, beside the arm")
     joints = np.flatnonzero(of_joint == chosen)
-    refuse = lambda what: ValueError(f"source: expected a planar chain, got {what}.")
     for joint in joints:
         if model.jnt_type[joint] not in (_HINGE, _SLIDE):
             kind = f"joint {read.name_of('joint', joint)}"
@@ -206,10 +221,13 @@ def _joints_of_arm(read: Reader, tip: str | None) -> tuple[np.ndarray, np.ndarra
         if len(following) > 1:
             both = " and ".join(map(name, following[:2]))
             raise refuse(f"branches: bodies {both} both follow body {name(body)}")
+    free = ~np.isin(joints, [joint for joint, _ in read.locked().values()])
+    if not free.any():
+        raise refuse("joints that are all locked")
     links = np.where(tree_of < 0, 0, -1)
-    for k, body in enumerate(model.jnt_bodyid[joints], start=1):
+    for k, body in zip(np.cumsum(free), model.jnt_bodyid[joints]):
         links[welded == body] = k  # of several joints of a body, the last one
-    return joints, links
+    return joints[free], links
 
 
 def _plane(
@@ -247,7 +265,8 @@ def _note_joints(
             where = "in the plane" if slide else "along the first hinge's"
             raise ValueError(
                 f"source: expected the axis of joint {name} {where}, got one "
-                f"{angle:.2g} rad off."
+                f"{angle:.2g} rad off. A spec = mujoco.MjSpec.from_file(path) is read "
+                f"without it after spec.delete(spec.joint({name!r}))."
             )
         if angle > _EXACT:
             off = f"axis laid into the plane, {angle:.1g} rad off"
@@ -284,8 +303,8 @@ def _tip(
     kind = kinds(int(model.geom_type[geom]))
     if kind in (kinds.mjGEOM_CAPSULE, kinds.mjGEOM_CYLINDER):
         reach = model.geom_size[geom, 1] * data.geom_xmat[geom].reshape(3, 3)[:, 2]
-        ends = [chain.plane(center + side * reach) for side in (1, -1)]
-        return max(ends, key=lambda end: abs(end - start)), "the end of the last geom"
+        ends = chain.plane(np.array([center + reach, center - reach]))
+        return ends[abs(ends - start).argmax()], "the end of the last geom"
     return chain.plane(center), "the centre of the last geom"
 
 
@@ -307,17 +326,17 @@ def _linkage(
     offsets, (masses, inertias) = np.zeros(count, complex), np.zeros((2, count))
     for k in range(count):
         bodies = np.flatnonzero(chain.links == k + 1)  # none between joints of one body
-        mass = model.body_mass[bodies]
+        mass, places = model.body_mass[bodies], chain.plane(data.xipos[bodies])
         if not mass.sum() > 0:
             continue
-        places = np.array([chain.plane(data.xipos[b]) for b in bodies])
-        center = complex(mass @ places / mass.sum())
+        masses[k] = mass.sum()
+        center = mass @ places / masses[k]
         frames = data.ximat[bodies].reshape(-1, 3, 3)
         own = (frames.transpose(0, 2, 1) @ chain.normal) ** 2
-        inertia = (own * model.body_inertia[bodies]).sum()
-        masses[k] = mass.sum()
-        inertias[k] = inertia + mass @ np.abs(places - center) ** 2
+        inertias[k] = (own * model.body_inertia[bodies]).sum()
+        inertias[k] += mass @ np.abs(places - center) ** 2
         offsets[k] = (center - starts[k + 1]) * np.exp(-1j * turns[k + 1])
+    masses, inertias = (np.where(v > _NOTHING, v, 0) for v in (masses, inertias))
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", ".*moves no inertia of link")

@@ -6,12 +6,14 @@ import numpy as np
 
 from .. import Element, JointDamper, Point, SpringDamper
 from ..forces import Armature, JointFriction, JointSpring, JointStops
-from .actuators import inertias_of_actuators
+from .actuators import inertias_of_actuators, sum_of
 from .chain import FAR, Chain, Reader
+from .law import Actuators
 
 # A stop of MuJoCo is close to plastic; this damping [s/m or s/rad] returns a tenth of
 # the speed of 1 m/s or 1 rad/s.
 _STOP_DAMPING = 10.0
+_RANGE = "a range, which joints alone have here (a stiff cable or bumper is near it)"
 
 
 def elements_in_joints(read: Reader, chain: Chain) -> list[Element]:
@@ -38,13 +40,9 @@ def elements_in_joints(read: Reader, chain: Chain) -> list[Element]:
         if len(there) and kind not in read.drop:
             forces.append(element(*values))
 
-    damping = np.array(model.dof_damping[rates])
-    armature = np.array(model.dof_armature[rates])
-    for gears, own_damping, own_armature in inertias_of_actuators(read, chain):
-        damping += gears**2 * own_damping
-        armature += gears**2 * own_armature
-    add("damping", "PASSIVE DAMPER", JointDamper, damping)
-    add("armature", "", Armature, armature)
+    damping, armature = inertias_of_actuators(read, chain)
+    add("damping", "PASSIVE DAMPER", JointDamper, damping + model.dof_damping[rates])
+    add("armature", "", Armature, armature + model.dof_armature[rates])
     rest = chain.signs * model.qpos_spring[chain.places]
     add("springs", "PASSIVE SPRING", JointSpring, model.jnt_stiffness[joints], rest)
     friction = model.dof_frictionloss[rates]
@@ -58,31 +56,30 @@ def elements_in_joints(read: Reader, chain: Chain) -> list[Element]:
 def _stops(read: Reader, chain: Chain, limited: np.ndarray) -> list[Element]:
     """Stops in the place of ranges, as stiff as MuJoCo's constraints are at qpos0."""
     model, dropped = read.model, "limits" in read.drop
-    low, high = read.bounds("jnt_", chain.joints, chain.signs)
     # MuJoCo's constraint acts from the margin within the range on.
-    margin = model.jnt_margin[chain.joints]
-    lower, upper = low + margin, high - margin
-    stiffness = np.ones(len(limited))
-    for k, joint in enumerate(chain.joints):
-        # What a constraint with the reference (time, damping ratio), or (-stiffness,
-        # -damping), gives way under a steady load, at its greatest impedance.
-        time, ratio = model.jnt_solref[joint]
-        if limited[k] and time >= 0 and not ratio > 0:
-            read.leave("limits", f"joint {chain.names[k]}", "a damping ratio of 0")
-            return []
-        if time >= 0 and not read.disabled("REFSAFE"):
-            time = max(time, 2 * model.opt.timestep)
-        impedance = min(max(model.jnt_solimp[joint, 1], 1e-4), 1 - 1e-4)
-        rate = -time if time < 0 else 1 / max(time * ratio, 1e-9) ** 2
-        mass = 1 / max(float(model.dof_invweight0[chain.rates[k]]), 1e-15)
-        stiffness[k] = max(mass * rate / (1 - impedance), 1e-9)
-        if limited[k]:
-            words = "left out, as asked"
-            if not dropped:
-                words = f"JointStops of {stiffness[k]:.3g} N/m or N m/rad, about as "
-                words += "stiff as MuJoCo's soft constraint"
-            ends = f"range {lower[k]:.4g} to {upper[k]:.4g}"
-            read.note(f"joint {chain.names[k]}", f"{ends}: {words}")
+    within = np.outer((1, -1), model.jnt_margin[chain.joints])
+    lower, upper = within + read.bounds("jnt_", chain.joints, chain.signs)
+    # What a constraint with the reference (time, damping ratio), or (-stiffness,
+    # -damping), gives way under a steady load, at its greatest impedance.
+    time, ratio = model.jnt_solref[chain.joints].T
+    least = 0.0 if read.disabled("REFSAFE") else 2 * model.opt.timestep
+    lag = np.maximum(np.maximum(time, least) * ratio, 1e-9)
+    impedance = np.clip(model.jnt_solimp[chain.joints, 1], 1e-4, 1 - 1e-4)
+    mass = 1 / np.maximum(model.dof_invweight0[chain.rates], 1e-15)
+    stiffness = mass * np.where(time < 0, -time, lag**-2) / (1 - impedance)
+    stiffness = np.where(limited, np.maximum(stiffness, 1e-9), 1)
+    for k in np.flatnonzero(limited):
+        name, words = f"joint {chain.names[k]}", "left out, as asked"
+        if time[k] >= 0 and not ratio[k] > 0:
+            read.leave("limits", name, "a damping ratio of 0")
+        if lower[k] >= upper[k]:
+            read.leave("limits", name, "a range that its margins fill")
+        if not dropped:
+            words = (
+                f"JointStops of {stiffness[k]:.3g} N/m or N m/rad, about as stiff as "
+            )
+            words += "MuJoCo's soft constraint"
+        read.note(name, f"range {lower[k]:.4g} to {upper[k]:.4g}: {words}")
     if dropped:
         return []
     return [JointStops(lower, upper, stiffness=stiffness, damping=_STOP_DAMPING)]
@@ -92,6 +89,7 @@ def springs_of_tendons(read: Reader, chain: Chain) -> list[Element]:
     """Springs and dampers between two sites."""
     model, forces = read.model, []
     no_limits = read.disabled("LIMIT", "CONSTRAINT")
+    sprung, damped = (not read.disabled("PASSIVE", f) for f in ("SPRING", "DAMPER"))
     for tendon in range(model.ntendon):
         name = f"tendon {read.name_of('tendon', tendon)}"
         if not (chain.links[_bodies_of(read, tendon)] > 0).any():
@@ -101,7 +99,7 @@ def springs_of_tendons(read: Reader, chain: Chain) -> list[Element]:
             read.note(name, "left out, as asked")
             continue
         for array, kind, what in (
-            ("tendon_limited", "limits", "a range"),
+            ("tendon_limited", "limits", _RANGE),
             ("tendon_actfrclimited", "tendons", "a limit of actuator forces"),
             ("tendon_frictionloss", "friction", "friction"),
             ("tendon_armature", "tendons", "an armature"),
@@ -112,20 +110,33 @@ def springs_of_tendons(read: Reader, chain: Chain) -> list[Element]:
             off = kind == "limits" and no_limits
             if read.has(array, tendon) and not off:
                 read.leave(kind, name, what)
-        stiffness = damping = 0.0
-        if not read.disabled("PASSIVE", "SPRING"):
-            stiffness = float(model.tendon_stiffness[tendon])
-        if not read.disabled("PASSIVE", "DAMPER"):
-            damping = float(model.tendon_damping[tendon])
+        stiffness = sprung * float(model.tendon_stiffness[tendon])
+        damping = damped * float(model.tendon_damping[tendon])
+        law = stiffness, damping, *map(float, model.tendon_lengthspring[tendon])
         if not stiffness and not damping:
             continue
-        if points := _ends(read, chain, tendon):
-            low, high = map(float, model.tendon_lengthspring[tendon])
-            forces += _springs(points, stiffness, damping, low, high)
+        elif points := _ends(read, chain, tendon):
+            forces += _springs(points, *law)
             read.note(name, "SpringDamper")
+        elif (gear := sum_of(read, chain, tendon)) is not None:
+            forces.append(_spring_of_sum(gear, *law))
+            read.note(name, "Actuators, that act as its spring and damper")
         else:
-            read.leave("tendons", name, "a spring that is not between two sites of it")
+            what = "a spring that is neither between two sites nor on joints of it"
+            read.leave("tendons", name, what)
     return forces
+
+
+def _spring_of_sum(
+    gear: np.ndarray, k: float, damping: float, low: float, high: float
+) -> Actuators:
+    """A spring on a sum of joint positions, slack between two lengths; and a damper."""
+    bias = [[k * low, -k, 0], [k * high, -k, 0], [0, 0, -damping]]
+    ends: Any = dict(lower=[0, -np.inf, -np.inf], upper=[np.inf, 0, np.inf])
+    if low == high:
+        bias, ends = [[k * low, -k, -damping]], {}
+    zero = np.zeros((len(bias), 3))
+    return Actuators([gear] * len(bias), zero, bias, zero[:, 0], **ends)
 
 
 def _springs(
@@ -133,31 +144,29 @@ def _springs(
 ) -> list[SpringDamper]:
     """Springs that are slack between two lengths; the damper always acts."""
     if low == high:
-        keywords: Any = dict(stiffness=k, damping=damping, rest_length=low)
-        return [SpringDamper(*points, **keywords)]
+        return [SpringDamper(*points, stiffness=k, damping=damping, rest_length=low)]
     springs = [SpringDamper(*points, damping=damping)] if damping else []
     for side, length, there in (("bumper", low, low > 0), ("cable", high, high < FAR)):
         if there and k:
-            keywords = dict(stiffness=k, rest_length=length, one_sided=side)
+            keywords: Any = dict(stiffness=k, rest_length=length, one_sided=side)
             springs.append(SpringDamper(*points, **keywords))
     return springs
 
 
 def _bodies_of(read: Reader, tendon: int) -> list[int]:
     """The bodies on which a tendon acts."""
-    model, kinds = read.model, read.mujoco.mjtWrap
-    owners = {
-        int(kinds.mjWRAP_JOINT): model.jnt_bodyid,
-        int(kinds.mjWRAP_SITE): model.site_bodyid,
-        int(kinds.mjWRAP_SPHERE): model.geom_bodyid,
-        int(kinds.mjWRAP_CYLINDER): model.geom_bodyid,
-    }
-    path = read.path_of_tendon(tendon)
-    return [
-        int(owners[int(kind)][thing])
-        for kind, thing in zip(model.wrap_type[path], model.wrap_objid[path])
-        if int(kind) in owners
-    ]
+    model, path = read.model, read.path_of_tendon(tendon)
+    on_geom = model.geom_bodyid
+    owners = (
+        None,
+        model.jnt_bodyid,
+        None,
+        model.site_bodyid,
+        on_geom,
+        on_geom,
+    )  # mjtWrap
+    parts = zip(model.wrap_type[path], model.wrap_objid[path])
+    return [owners[kind][thing] for kind, thing in parts if owners[kind] is not None]
 
 
 def _ends(read: Reader, chain: Chain, tendon: int) -> tuple[Point, Point] | None:
@@ -173,7 +182,7 @@ def _ends(read: Reader, chain: Chain, tendon: int) -> tuple[Point, Point] | None
     places = data.site_xpos[sites]
     if (links < 0).any() or abs((places[1] - places[0]) @ chain.normal) > 1e-9:
         return None
-    local = np.array([*map(chain.plane, places)]) - chain.starts[links]
+    local = chain.plane(places) - chain.starts[links]
     local *= np.exp(-1j * chain.turns[links])
     a, b = (Point(int(link), p.real, p.imag) for link, p in zip(links, local))
     return a, b

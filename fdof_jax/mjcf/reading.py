@@ -19,16 +19,14 @@ KINDS = (
     "actuators", "armature", "contacts", "damping", "equalities", "fluid", "friction",
     "gravcomp", "limits", "plugins", "springs", "tendons",
 )  # fmt: skip
-# A fluid whose forces are this part of all others at a rate of 1 rad/s or 1 m/s is
-# taken for none.
+# A fluid with this part of all forces, at rates of size 1, is taken for none.
 _NEGLIGIBLE = 1e-9
 
 
 class Account(NamedTuple):
     """What `from_mjcf` made of each part of a model: a table that prints itself.
 
-    - `lines`: pairs of a part of the model, and of what it became or why it was left
-      out.
+    - `lines`: pairs of a part, and of what it became or why it was left out.
     """
 
     lines: list[tuple[str, str]]
@@ -64,19 +62,15 @@ def from_mjcf(
     """Reads a planar chain of hinges and slides from a model of MuJoCo (MJCF or URDF).
 
     The plane is seen from where the first hinge's axis points, with gravity downwards,
-    so that x may be -X of the model's world, as the account says;
-    gravity across the plane has no effect. `q` equals `qpos`, with the opposite sign at
-    hinges that turn the other way. A body with several joints becomes as many links,
-    all but the last without mass. What is welded belongs to its link. Chains beside the
-    arm are left out: the arm is the chain with most actuators, or else most joints.
-    MuJoCo reads the model, which needs `pip install "fdof_jax[test]"`.
+    so that x may be -X of the model's world. `q` equals `qpos`, with the opposite sign
+    at hinges that turn the other way. A body with several joints becomes as many links,
+    all but the last without mass. What is welded, or locked by an equality, belongs to
+    its link. The arm is the chain with most actuators, or else most joints. Texts may
+    have what MuJoCo or ROS allow. MuJoCo reads them: `pip install "fdof_jax[test]"`.
 
-    Damping, armature, springs, actuators and spatial tendons between two sites become
-    elements that act alike: position and velocity servos a `PDController`, motors a
-    `JointEffort`, others `Actuators`. MuJoCo's soft ranges become `JointStops` that are
-    about as stiff, and its friction loss `JointFriction`, which holds still where
-    MuJoCo's creeps. What the library does not have is refused, or left out on purpose
-    by `drop`. The `account` says all of it.
+    What acts on the arm becomes elements that act alike, or nearly so: stops and
+    friction are soft in MuJoCo. What the library does not have is refused, or left out
+    by `drop`; the account says all of it.
 
     **Arguments:**
 
@@ -85,8 +79,7 @@ def from_mjcf(
     - `controls`: of the actuators, in MuJoCo's order and units; by default those of the
       first key frame, or 0. `replace` changes them in the elements.
     - `tip`: name of the site or body that is the tip; by default one named tip, ee,
-      tool, hand or end_effector on the last link, or else the end of its last geom, or
-      its last body.
+      tool, hand or end_effector on the last link, or else its last geom or body.
     - `drop`: kinds of parts to leave out: "actuators", "armature", "contacts",
       "damping", "equalities", "fluid", "friction", "gravcomp", "limits", "plugins",
       "springs", "tendons".
@@ -120,15 +113,14 @@ def from_mjcf(
     drop = (drop,) if isinstance(drop, str) else drop
     if not isinstance(drop, tuple | list):
         raise refusal("drop", f"a tuple of kinds among {KINDS}", drop)
-    for kind in drop:
-        if kind not in KINDS:
-            raise refusal("drop", f"kinds among {KINDS}", kind)
+    if unknown := [kind for kind in drop if kind not in KINDS]:
+        raise refusal("drop", f"kinds among {KINDS}", unknown[0])
     if tip is not None and not isinstance(tip, str):
         raise refusal("tip", "the name of a site or a body", tip)
-    model, left = compiled_model(mujoco, source)
+    model, remarks, robot = compiled_model(mujoco, source)
     read = Reader(mujoco, model, drop, [])
-    for what in left:
-        read.note("source", f"left out: {what}")
+    for words in remarks:
+        read.note("source", words)
     linkage, chain = planar_chain(read, tip)
     forces = [
         *elements_in_joints(read, chain),
@@ -137,7 +129,7 @@ def from_mjcf(
     ]
     _check_rest(read, chain)
     start = _start(read, chain)
-    _check_contacts(read, chain)
+    _check_contacts(read, chain, robot)
     return MjcfModel(linkage, start, tuple(forces), Account(read.lines))
 
 
@@ -155,25 +147,22 @@ def _start(read: Reader, chain: Chain) -> State:
 
 def _check_rest(read: Reader, chain: Chain) -> None:
     """Leaves out constraints, compensated gravity and fluids, or raises ValueError."""
-    model, mujoco = read.model, read.mujoco
-    things = mujoco.mjtObj
-    if not read.disabled("EQUALITY", "CONSTRAINT"):
-        for index in range(model.neq):
-            name = f"equality {read.name_of('equality', index)}"
-            kind = mujoco.mjtEq(int(model.eq_type[index]))
-            of_bodies = kind in (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)
-            ends = np.array([model.eq_obj1id[index], model.eq_obj2id[index]])
-            ends = ends[ends >= 0]
-            if of_bodies and things(int(model.eq_objtype[index])) == things.mjOBJ_SITE:
-                ends = model.site_bodyid[ends]
-            elif kind == mujoco.mjtEq.mjEQ_JOINT:
-                ends, of_bodies = model.jnt_bodyid[ends], True
-            if not model.eq_active0[index]:
-                read.note(name, "left out, as it is not active")
-            elif of_bodies and (chain.links[ends] <= 0).all():
-                read.note(name, "left out, beside the arm")
-            else:
-                read.leave("equalities", name, "a loop or another constraint")
+    model, held = read.model, read.locked()
+    owners = {1: np.arange(model.nbody), 6: model.site_bodyid}  # by MuJoCo's mjtObj
+    for index in range(0 if read.disabled("EQUALITY", "CONSTRAINT") else model.neq):
+        name = f"equality {read.name_of('equality', index)}"
+        of_joints = int(model.eq_type[index]) == int(read.mujoco.mjtEq.mjEQ_JOINT)
+        owner = model.jnt_bodyid if of_joints else owners.get(model.eq_objtype[index])
+        ends = np.array([model.eq_obj1id[index], model.eq_obj2id[index]])
+        if not model.eq_active0[index]:
+            read.note(name, "left out, as it is not active")
+        elif index in held:
+            joint = read.name_of("joint", held[index][0])
+            read.note(name, f"joint {joint} is fixed at {held[index][1]:.4g}")
+        elif owner is not None and (chain.links[owner[ends[ends >= 0]]] <= 0).all():
+            read.note(name, "left out, beside the arm")
+        else:
+            read.leave("equalities", name, "a loop or another constraint")
     for body in np.flatnonzero(chain.links > 0):
         name = f"body {read.name_of('body', body)}"
         if model.body_plugin[body] >= 0:
@@ -189,20 +178,20 @@ def _check_rest(read: Reader, chain: Chain) -> None:
 
 
 def _drag(read: Reader, chain: Chain) -> float:
-    """Greatest force of the fluid over that of inertia, at random rates of size 1."""
-    model, rates, ratios = read.model, chain.rates, [0.0]
-    data, draw = read.data_at_start(), np.random.default_rng(0)
-    for _ in range(5):
-        data.qpos[chain.places] = draw.normal(size=len(rates))
-        data.qvel[rates] = draw.normal(size=len(rates))
-        read.mujoco.mj_forward(model, data)
-        others = abs(data.qfrc_bias[rates]).max() + model.dof_M0[rates].max()
-        ratios.append(abs(data.qfrc_fluid[rates]).max() / others)
-    return max(ratios)
+    """The force of the fluid over that of inertia, in a random state of size 1."""
+    model, rates, data = read.model, chain.rates, read.data_at_start()
+    state = np.random.default_rng(0).normal(size=(2, len(rates)))
+    data.qpos[chain.places], data.qvel[rates] = state
+    read.mujoco.mj_forward(model, data)
+    others = abs(data.qfrc_bias[rates]).max() + model.dof_M0[rates].max()
+    return abs(data.qfrc_fluid[rates]).max() / others
 
 
-def _check_contacts(read: Reader, chain: Chain) -> None:
-    """Raises ValueError for bodies that touch at the start, warns of those that may."""
+def _check_contacts(read: Reader, chain: Chain, robot: bool) -> None:
+    """Raises ValueError for bodies that touch at the start, warns of those that may.
+
+    Of a `robot`, as in ROS, the ground and the first link do not collide either.
+    """
     model, mujoco, links = read.model, read.mujoco, chain.links
     if read.disabled("CONTACT", "CONSTRAINT"):
         return
@@ -212,45 +201,44 @@ def _check_contacts(read: Reader, chain: Chain) -> None:
             mujoco.mj_fwdPosition(model, data)
         except mujoco.FatalError as error:  # thousands of contacts
             read.leave("contacts", "the model", str(error))
-    name = lambda body: read.name_of("body", body)
+    both = lambda pair: "bodies " + " and ".join(read.name_of("body", b) for b in pair)
+    apart = lambda pair: not (robot and sorted(links[[*pair]]) == [0, 1])
     for contact in data.contact[: data.ncon]:
-        a, b = model.geom_bodyid[contact.geom]
+        pair = model.geom_bodyid[contact.geom]
         touch = contact.geom.min() >= 0 and contact.dist <= 0
-        if touch and max(links[a], links[b]) > 0:
-            read.leave("contacts", f"bodies {name(a)} and {name(b)}", "a contact")
-    if (pair := _may_collide(read, links)) is None:
+        if touch and max(links[pair]) > 0 and apart(pair):
+            read.leave("contacts", both(pair), "a contact")
+    pairs = [pair for pair in _may_collide(read) if max(links[[*pair]]) > 0]
+    if not all(map(apart, pairs)):
+        read.note("contacts", "left out between the ground and the first link")
+    if not (words := next(map(both, filter(apart, pairs)), "")):
         return
-    both = " and ".join(map(name, pair))
-    read.note("contacts", f"left out, though bodies {both} may collide")
+    read.note("contacts", f"left out, though {words} may collide")
     if "contacts" not in read.drop:
         warnings.warn(
-            f"source: contacts are left out, but bodies {both} of this model may "
-            "collide; drop=('contacts',) omits this warning.",
+            f"source: contacts are left out, but {words} of this model may collide; "
+            "drop=('contacts',) omits this warning.",
             stacklevel=3,
         )
 
 
-def _may_collide(read: Reader, links: np.ndarray) -> tuple[int, int] | None:
-    """Two bodies, one of the arm, whose geoms may collide in MuJoCo, if any.
+def _may_collide(read: Reader) -> list[tuple[int, int]]:
+    """Pairs of bodies whose geoms may collide in MuJoCo.
 
-    Geoms of bodies that are welded together, or next to each other in the chain, do
-    not; the moving bodies next to the ground may collide with it.
+    Bodies that are welded together do not, nor do neighbours but for the ground.
     """
-    model = read.model
-    bodies = model.geom_bodyid
-    pairs = [*zip(bodies[model.pair_geom1], bodies[model.pair_geom2])]
+    model, bodies = read.model, read.model.geom_bodyid
+    pairs = zip(bodies[model.pair_geom1], bodies[model.pair_geom2])
     welded, before = model.body_weldid, model.body_weldid[model.body_parentid]
     # There may be thousands of geoms, of which few are different.
     owner = bodies if model.nexclude else welded[bodies]
-    kinds = np.stack([owner, model.geom_contype, model.geom_conaffinity], axis=1)
-    kinds = np.unique(kinds, axis=0)
-    body = kinds[:, 0]
-    a, b = np.triu_indices(len(kinds), 1)
-    meet = (kinds[a, 1] & kinds[b, 2]) | (kinds[b, 1] & kinds[a, 2])
+    kinds = np.stack([owner, model.geom_contype, model.geom_conaffinity])
+    body, own, other = np.unique(kinds, axis=1)
+    a, b = np.triu_indices(len(body), 1)
+    meet = (own[a] & other[b]) | (own[b] & other[a])
     u, v = welded[body[a]], welded[body[b]]
     next_to = ((u > 0) & (before[v] == u)) | ((v > 0) & (before[u] == v))
     next_to &= not read.disabled("FILTERPARENT")
     excluded = np.isin((body[a] << 16) + body[b], model.exclude_signature)
     may = (meet != 0) & (u != v) & ~next_to & ~excluded
-    pairs += zip(body[a[may]], body[b[may]])
-    return next((pair for pair in pairs if max(links[[*pair]]) > 0), None)
+    return [*pairs, *zip(body[a[may]], body[b[may]])]
