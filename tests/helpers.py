@@ -13,8 +13,7 @@ import numpy as np
 import fdof_jax as fj
 
 REFERENCE = json.loads((Path(__file__).parent / "reference.json").read_text())
-# The library rejects PPP, which the file holds for the equations only.
-SCENES = {s["id"]: s for s in REFERENCE["scenes"] if s["topology"] != "PPP"}
+SCENES = {s["id"]: s for s in REFERENCE["scenes"]}
 
 
 def programs():

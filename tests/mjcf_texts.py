@@ -199,6 +199,10 @@ MASS = ('<body pos="0 0 .01"><joint name="x" type="slide" axis="1 0 0" range="-.
 add("point mass", "no hinge, limits, xy plane, several joints, gravity across", 2, mjcf(
     MASS, tail='<actuator><motor joint="x" gear=".1"/><motor joint="y" gear=".1" '
     'ctrlrange="-1 1"/></actuator>'))
+SLIDE = ('<body pos=".3 0 .1"><joint type="slide" axis="{}" damping="{}"/><geom size='
+    '".05"/>{}</body>')
+add("slides alone", "slide, no hinge", 4, mjcf(SLIDE.format("1 0 0", 1, SLIDE.format(
+    "0 0 1", 2, SLIDE.format("1 0 .7", 3, SLIDE.format("1 0 -2", 4, ""))))))
 add("point mass on tendons", "no hinge, limits, dropped tendons, dropped actuators", 2,
     mjcf(MASS, tail='<tendon><fixed name="t"><joint joint="x" coef=".6"/><joint '
     'joint="y" coef=".8"/></fixed></tendon><actuator><motor tendon="t" '

@@ -184,7 +184,6 @@ TOPOLOGY_WORDS = {
     ],
     "one real joint at most in each": [[0, 1, 1, 1], [1, 1, 0, 1]],
     "a joint that moves, got fixed pairs": ["FFF", [0] * 6],
-    r"one joint that turns among .*PPP cannot": ["PPP", "PFPP", [1, 0] * 3],
 }  # fmt: skip
 
 

@@ -298,6 +298,17 @@ CIRCLE = fj.references.Ellipse([0.5, 0.5], [0.1, 0.1])
 
 
 @pytest.mark.slow
+def test_slides_alone_orient_nothing():
+    arm = fj.Linkage(
+        "PPP", length=[0, 1, 1, 1], com=np.zeros((3, 2)), mass=1 + np.zeros(3),
+        inertia=np.zeros(3), locked=[0.5, 0.7, 0.3],
+    )  # fmt: skip
+    with pytest.raises(ValueError, match="^linkage: expected a joint that turns"):
+        fj.inverse_kinematics(arm, [1, 1], 0.3)
+    traced = jax.jit(lambda arm: fj.inverse_kinematics(arm, [1, 1], 0.3))
+    assert np.isnan(traced(arm)).all()
+
+
 @pytest.mark.parametrize("topology, orientation", OTHER_NUMBERS)
 def test_chains_of_other_numbers_of_joints_are_refused(topology, orientation):
     wanted, count = 2 if orientation is None else 3, len(topology.replace("F", ""))

@@ -31,6 +31,7 @@ COINCIDING = dict(length=[0, 1, 0, 1], locked=0, com=[[1, 0], [0, 0], [1, 0]])
      TOGETHER("1 and 2", "PPR", ALONG)),
     ("PPR", dict(mass=[0, 0, 1], inertia=[1, 1, 0]),
      TOGETHER("1 and 2 and 3", "PPR", "")),
+    ("PPP", dict(mass=[0, 0, 1]), TOGETHER("1 and 2 and 3", "PPP", "")),
 ])  # fmt: skip
 def test_joints_that_move_nothing_are_refused(topology, changes, message):
     with pytest.raises(ValueError, match=f"^mass, inertia, com: expected .*{message}"):

@@ -79,7 +79,8 @@ def check_singularity(linkage: Numbers) -> None:
             if scaled[:, k, k].max() > 0:  # it moves some, but others can undo that
                 parts = k + np.flatnonzero(np.abs(modes[:, :, 0]).max(axis=0) > 1e-3)
                 joints = " and ".join(str(joint + 1) for joint in parts)
-                line = "" if revolute[parts].any() else " along the same line"
+                alike = len(parts) == 2 and not revolute[parts].any()
+                line = " along the same line" if alike else ""
                 raise ValueError(
                     f"mass, inertia, com: expected joints {joints} of {names} to move "
                     "some inertia however they move together, got joints that can move "

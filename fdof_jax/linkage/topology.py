@@ -76,23 +76,12 @@ def pairs_of(topology: Any) -> np.ndarray | None:
             f"pair of existence factors (equation 4), got "
             f"{shown(pairs.astype(int).tolist())}."
         )
-    if not can_move(pairs):
-        raise ValueError(
-            "topology: expected a joint that moves, got fixed pairs only."
-            if not pairs.any()
-            else "topology: expected one joint that turns among three or more (PPP "
-            f"cannot orient its last link), got {letters(pairs)}."
-        )
+    if not pairs.any():
+        raise ValueError("topology: expected a joint that moves, got fixed pairs only.")
     return pairs
 
 
 _SIZES = range(2, 2 * MOST_PAIRS + 1, 2)
-
-
-def can_move(pairs: Array | np.ndarray) -> Array:
-    """Returns whether the paper's rule on slides and ours on fixed pairs are met."""
-    number = pairs.sum()
-    return (number > 0) & ((number <= 2) | (pairs[:, 1].sum() > 0))
 
 
 def existence_factors(topology: str) -> Float[Array, " factor"]:

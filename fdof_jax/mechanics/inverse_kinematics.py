@@ -42,7 +42,7 @@ class Arm(NamedTuple):
       (2,), which no joint moves [m].
     - `place`: places of the joints among those of the linkage (n,), None if it has no
       others. `offset`: what positions have beyond those in the linkage [m or rad].
-    - `valid`: zeros (n,), or NaN if another number of joints moves.
+    - `valid`: zeros (n,), or NaN if another number of joints moves, or none turns.
     """
 
     revolute: Scalars
@@ -75,7 +75,8 @@ class Arm(NamedTuple):
 def check_moving_joints(linkage: Linkage, oriented: bool) -> None:
     """Raises ValueError unless three joints move, or two without an orientation.
 
-    Of traced existence factors, only their number is checked.
+    Slides alone orient nothing. Of traced existence factors, only their number is
+    checked.
     """
     wanted, n, traced = 2 + oriented, joints_of(linkage), is_traced(linkage.ef)
     count = n if traced else int(np.asarray(linkage.ef).sum())
@@ -87,13 +88,18 @@ def check_moving_joints(linkage: Linkage, oriented: bool) -> None:
             f"linkage: expected {wanted} joints that move{also}, the others fixed, got "
             f"{got}{cure}."
         )
+    if oriented and not traced and not np.any(real_joints(np.asarray(linkage.ef))):
+        raise ValueError(
+            "linkage: expected a joint that turns where an orientation is commanded, "
+            "got slides alone."
+        )
 
 
 def arm_of(linkage: Linkage, orientation: Array | float | None) -> Arm:
     """Returns a linkage as an arm of three joints whose last link has an orientation.
 
     Without one, two joints move, and a third one that turns at the tip takes any
-    direction. If another number of joints moves, all positions are NaN.
+    direction. If another number of joints moves, or none turns, all positions are NaN.
     """
     oriented, n = orientation is not None, joints_of(linkage)
     check_moving_joints(linkage, oriented)
@@ -127,7 +133,8 @@ def arm_of(linkage: Linkage, orientation: Array | float | None) -> Arm:
     second = jnp.where(r1, from_tip - locked[1], ground + locked[0])
     third = jnp.where(r3, second + locked[1], from_tip)
     angle = jnp.stack([ground, second, third, last])
-    valid = jnp.where(jnp.sum(linkage.ef) == wanted, 0, jnp.nan)
+    fits = (jnp.sum(linkage.ef) == wanted) & jnp.any(revolute)
+    valid = jnp.where(fits, 0, jnp.nan)
     return Arm(
         revolute=tuple(revolute),
         locked=locked,
@@ -239,10 +246,11 @@ def inverse_kinematics(
 ) -> Float[Array, " joint"]:
     """Computes joint positions for a tip position and a direction of the last link.
 
-    The solution is in closed form for every topology of three joints that move, and of
-    two where no orientation is commanded. It is selected by the existence factors;
-    fixed pairs may be anywhere. The direction from the first joint to the last link's
-    start is in (-pi, pi]; the angles follow from it without wrapping.
+    The solution is in closed form for every topology of three joints that move, one of
+    which turns, and of two where no orientation is commanded. It is selected by the
+    existence factors; fixed pairs may be anywhere. The direction from the first joint
+    to the last link's start is in (-pi, pi]; the angles follow from it without
+    wrapping.
 
     **Arguments:**
 
@@ -261,7 +269,7 @@ def inverse_kinematics(
     known to 1e-16 m may leave them known to 1e-8 rad.
 
     **Raises:** ValueError for malformed arguments, for a linkage of another number of
-    joints, and for concrete arguments if the point is out of reach.
+    joints or of three slides, and for concrete arguments if the point is out of reach.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig7().linkage
