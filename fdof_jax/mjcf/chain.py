@@ -266,7 +266,7 @@ def _note_joints(
             raise ValueError(
                 f"source: expected the axis of joint {name} {where}, got one "
                 f"{angle:.2g} rad off. A spec = mujoco.MjSpec.from_file(path) is read "
-                f"without it after spec.delete(spec.joint({name!r}))."
+                f"without it after spec.delete(spec.joint('{name}'))."
             )
         if angle > _EXACT:
             off = f"axis laid into the plane, {angle:.1g} rad off"
