@@ -93,15 +93,16 @@ def condition(value: Any, expected: str, q: Array) -> Array:
     Where it is NaN, efforts are, too: no zero would be seen. Raises ValueError for what
     is not one real number.
     """
-    number = isinstance(value, float | int | np.ndarray | np.generic | Array)
-    if not number or jnp.shape(value) != ():
-        got = f"one of shape {jnp.shape(value)}" if number else shown(value)
+    given = isinstance(value, float | int | np.ndarray | np.generic | Array)
+    if not given or jnp.shape(value) != ():
+        got = f"one of shape {jnp.shape(value)}" if given else shown(value)
         raise ValueError(f"{expected}, got {got}.")
     if (dtype := jnp.result_type(value)).kind not in "iuf":
         raise ValueError(f"{expected} which passes 0, got one of type {dtype}.")
-    none = jnp.full_like(q, jnp.where(jnp.isnan(value), jnp.nan, 0))
+    number = jnp.asarray(value, q.dtype)
+    none = jnp.full_like(q, jnp.where(jnp.isnan(number), jnp.nan, 0))
     # A switch of which nothing depends on the side.
-    return switch(jnp.asarray(value, q.dtype), none, none, continuous=True)
+    return switch(number, none, none, continuous=True)
 
 
 def resets_in(forces: Forces) -> tuple[Reset, ...]:

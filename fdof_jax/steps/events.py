@@ -70,8 +70,8 @@ class Switches(NamedTuple):
     grazing: Array
     grazing_here: Array
     modes: PyTree
-    late: Array | None
-    resets: Array | None
+    late: Any  # Array | None
+    resets: Any  # Array | None
     ended: Array | None
 
     @property
@@ -104,7 +104,7 @@ class Regime(NamedTuple):
     on_zero: Array
     sizes: Array
     grazing: Array
-    late: Array | None
+    late: Any  # Array | None
 
 
 class Events(eqx.Module):
@@ -198,11 +198,11 @@ class Events(eqx.Module):
         before = args._replace(sides=last.sides, modes=last.modes)
         fired = changed[-self.guards :].reshape(-1, last.modes.mode.size)
         time = jnp.where(last.early, t, last.until)
-        late, there, at, resets = jnp.zeros_like(t), y, t, None
+        late, there, at = jnp.zeros_like(t), y, t
+        resets: Any = None
         # What an event causes at once has the time of that event.
         comes = last.length > 0
         if self.derivatives:
-            assert last.late is not None
             arrived = changed & jumped & comes
             late = jax.lax.cond(
                 jnp.any(arrived),

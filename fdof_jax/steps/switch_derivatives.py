@@ -6,7 +6,7 @@ equations before, and back with those after: this changes nothing but derivative
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -31,7 +31,7 @@ class Event(NamedTuple):
     t: Array
     fired: Array
     late: Array
-    resets: Array | None
+    resets: Any  # Array | None
 
 
 @jax.custom_jvp
