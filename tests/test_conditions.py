@@ -194,6 +194,37 @@ def test_the_first_of_several_ends_it():
 
 
 @pytest.mark.slow
+def test_a_jump_that_carries_a_condition_over_its_zero_ends_the_motion_there():
+    """A bounce, with its derivatives, and a payload."""
+    rises = Until(lambda t, q, qd, linkage: qd[0] - 1, direction=1)
+
+    def bounced(x, **options):
+        q0, gravity, restitution = x
+        stop = fj.forces.HardStops(0, jnp.inf, restitution=restitution)
+        arm, start = MASS.replace(gravity=gravity), fj.State(q0[None], jnp.zeros(1))
+        end = fj.simulate(arm, start, [0, 2.0], (stop,), until=rises, **options).end
+        return jnp.stack([end.t, end.q[0], end.qd[0]])
+
+    def exactly(x):
+        q0, gravity, restitution = x
+        fast = jnp.sqrt(2 * gravity * q0)
+        return jnp.stack([fast / gravity, 0 * q0, restitution * fast])
+
+    x = jnp.array([1.0, 9.81, 0.6])
+    np.testing.assert_allclose(bounced(x), exactly(x), atol=1e-11)
+    expected = jax.jacfwd(exactly)(x)
+    for slopes in jax.jacfwd(lambda x: bounced(x, **FORWARD)), jax.jacrev(bounced):
+        np.testing.assert_allclose(jax.jit(slopes, **LOOPS)(x), expected, atol=1e-10)
+    load = fj.forces.Payload(fj.Point(1, 1.0), mass=1.5, begin=0.5, end=2.0)
+    slows, arm = lambda t, q, qd, linkage: qd[0] - 1, BAR.replace(gravity=0)
+    start = fj.State([0.0], [2.0])
+    end = fj.simulate(arm, start, [0, 1.0], (load,), until=slows).end
+    kept = (1 / 3) / (1 / 3 + 1.5)
+    found = [end.t, end.q[0], end.qd[0]]
+    np.testing.assert_allclose(found, [0.5, 1, 2 * kept], atol=1e-12)
+
+
+@pytest.mark.slow
 def test_members_of_a_batch_end_by_themselves():
     """One ends, one never does, one fails; in a sweep, too, where it is an element."""
     speeds = jnp.array([1.0, 100.0, jnp.nan, 2.0])
@@ -231,6 +262,14 @@ def test_what_is_refused():
     end = lambda **options: fj.simulate(MASS, start, [0, 1.0], **options)
     with pytest.raises(ValueError, match=r"^until: expected .* got one of shape \(1,"):
         end(until=lambda t, q, qd, linkage: q)
+    with pytest.raises(ValueError, match=r"^until: expected .* number, got \[.*\]"):
+        end(until=lambda t, q, qd, linkage: [q[0]])
+    with pytest.raises(ValueError, match="^until: expected .* number, got 'a'"):
+        end(until=lambda t, q, qd, linkage: "a")
+    with pytest.raises(TypeError, match="^until.condition: expected a function"):
+        end(until=lambda t, q, qd: q[0])
+    with pytest.raises(TypeError, match="^until: expected jax.numpy"):
+        end(until=lambda t, q, qd, linkage: 1.0 if q[0] > 0 else -1.0)
     with pytest.raises(ValueError, match="^until: expected a function .* got 3"):
         end(until=3)
     with pytest.raises(ValueError, match="^until: expected a function"):

@@ -245,6 +245,34 @@ def test_what_turns_back_just_before_or_beyond_its_zero_is_seen():
     assert abs(throw(3.001)[0] - throw(3.001, 1e-12)[0]) < 1e-8
 
 
+@pytest.mark.slow
+def test_what_a_blow_switches_at_once_switches_at_the_time_of_the_blow():
+    """A ball is pushed by 1 N as it falls, and by -4 N as it rises."""
+
+    def place(x, **options):
+        q0, gravity, restitution = x
+        ball = fj.Linkage(
+            "P", length=[0, 0], com=[[0, 0]], mass=[1], inertia=[1], base_angle=0
+        ).replace(gravity=gravity)
+        stop = fj.forces.HardStops(0, jnp.inf, restitution=restitution)
+        push = lambda t, q, qd, linkage: fj.forces.switch(qd, -4 + 0 * q, 1 + 0 * q)
+        start = fj.State(q0[None], jnp.zeros(1))
+        return fj.simulate(ball, start, [0, 0.7], (stop, push), **options).q[-1, 0]
+
+    def exactly(x):
+        q0, gravity, restitution = x
+        fall = jnp.sqrt(2 * q0 / (gravity - 1))
+        speed, rest = restitution * (gravity - 1) * fall, 0.7 - fall
+        return speed * rest - (gravity + 4) * rest**2 / 2
+
+    x = jnp.array([1.0, 9.81, 0.9])  # it still rises at the end
+    slopes = jax.jacfwd(lambda x: place(x, adjoint=FORWARD))
+    np.testing.assert_allclose(slopes(x), jax.jacfwd(exactly)(x), atol=1e-9)
+    found = jax.jacfwd(slopes)(x)
+    np.testing.assert_allclose(found, jax.hessian(exactly)(x), atol=1e-7)
+    np.testing.assert_allclose(jax.grad(place)(x), jax.grad(exactly)(x), atol=1e-9)
+
+
 @pytest.mark.parametrize("transform", [jax.vmap, jax.jit])
 def test_a_switch_that_the_integrator_cannot_see_is_refused(transform):
     friction = transform(lambda q, qd: -fj.forces.switch(q, 0.1, 2.0) * qd)

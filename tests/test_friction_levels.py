@@ -229,7 +229,7 @@ def test_friction_of_a_function_is_written_to_files(tmp_path):
 @pytest.mark.parametrize(
     "value, words",
     [
-        (np.ones(2), "level: expected it to return numbers for 1 joints"),
+        (np.ones(2), "level: expected .* numbers for 1 joints, got shape \\(2,\\)"),
         (np.ones((3, 1)), "level: expected an array of n .* got shape"),
         ("much", "level: expected an array of n"),
     ],
@@ -238,6 +238,22 @@ def test_malformed_values_of_functions_are_refused(value, words):
     friction = JointFriction(lambda t, q, qd, linkage: value)
     with pytest.raises(ValueError, match=rf"^forces\[0\].{words}"):
         fj.simulate(SLIDE, REST, TS, (friction,))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "friction",
+    [
+        JointFriction(lambda t, q, qd, linkage: 1 - 2 * t),
+        JointFriction(lambda t, q, qd, linkage: 1 + t, static=1.2),
+    ],
+)
+def test_friction_that_becomes_what_it_cannot_be_ends_a_motion(friction):
+    """Negative, or static friction below the level."""
+    start = fj.State([0.0], [9.0])
+    motion = fj.simulate(SLIDE, start, [0, 1.0], (friction,), throw=False)
+    assert motion.outcome == "not finite"
+    assert 0.15 < motion.stats["time_reached"] < 0.51
 
 
 def test_malformed_numbers_of_stribeck_are_refused():
