@@ -142,6 +142,7 @@ def test_an_inductance_is_of_all_joints_or_of_none():
     assert not within.possible()  # while it is traced, it is taken for positive
 
 
+@pytest.mark.slow
 def test_a_speed_limit_in_four_quadrants():
     """Driving, it falls with the speed; braking, the whole effort is left."""
     drive = fj.control.SpeedLimit(fj.JointEffort([1.0]), 6.0, TOP)

@@ -206,6 +206,7 @@ def test_energy_stack_of_sampled_control_has_what_holders_take():
     )
 
 
+@pytest.mark.slow
 def test_energy_stack_integrates_friction_whose_level_is_a_function():
     """The motion does not count what it takes; a level of numbers is counted."""
     friction = JointFriction(lambda t, q, qd, linkage: 2.0), JointFriction(1.0)

@@ -205,6 +205,7 @@ class Wall(fj.Element):
         return -10 + fj.forces.switch(beyond, -1e5 * beyond, 0.0, continuous=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("near", [np.inf, 6e3])  # no length, and 3e-16 s of 2e-12
 def test_rounding_in_a_step_of_almost_no_length_is_no_switch(near):
     """Samples of one instant may differ by rounding, falling to the end."""

@@ -197,6 +197,7 @@ def test_stops_have_finite_derivatives_everywhere(smoothing):
 # Friction
 
 
+@pytest.mark.slow
 def test_friction_stops_a_slide():
     """From 2 dv/dt = -F tanh(v/s) it follows that sinh(v/s) falls exponentially."""
     level, speed, v0 = 4.0, 0.05, 1.5

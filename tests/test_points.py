@@ -80,6 +80,7 @@ class Pulse(eqx.Module):
         return jnp.where((t >= 3.0) & (t < 3.02), 100.0, 0.0) * jnp.array([1.0, 0.0])
 
 
+@pytest.mark.slow
 def test_a_pulse_that_says_when_is_not_stepped_over():
     arm = fj.Linkage(
         "RRR", length=[0, 1, 1, 1], com=[[0.5, 0]] * 3, mass=[1] * 3, inertia=[0.1] * 3

@@ -96,10 +96,10 @@ PID = fj.control.PIDController(9.0, 5.0, 1.0, 4.0, fj.references.SetPoint(0.2))
 STOPS = fj.forces.HardStops(-1.7, 0.4, restitution=0.5)
 
 
-STOPPED = pytest.param((STOPS,), marks=pytest.mark.slow)
+SLOW = [pytest.param(forces, marks=pytest.mark.slow) for forces in ((PID,), (STOPS,))]
 
 
-@pytest.mark.parametrize("forces", [(), (PID,), STOPPED])
+@pytest.mark.parametrize("forces", [(), *SLOW])
 def test_a_norm_of_the_user_s_own_judges_errors(forces):
     """Here it makes the tolerances a hundredth of what they are."""
     tight = diffrax.PIDController(rtol=1e-9, atol=1e-9)
