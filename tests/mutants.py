@@ -37,6 +37,8 @@ SWITCHES, HOLDING = "tests/test_switches.py", "tests/test_holding.py"
 HYBRID = "tests/test_hybrid_dynamics.py"
 KINKS = f"{SWITCHES}::test_kinks_of_high_gains_are_exact_in_derivatives"
 SAMPLED = "tests/test_sampled_control.py"
+CONDITIONS, RESETS = "tests/test_conditions.py", "tests/test_resets.py"
+EVER_FASTER = f"{RESETS}::test_jumps_that_follow_each_other_ever_faster_are_named[0.1]"
 BOUNCES = f"{HOLDING}::test_a_mass_bounces_to_rest_at_a_known_time"
 
 MUTANTS = {
@@ -61,7 +63,7 @@ MUTANTS = {
     ),
     "a known time has no derivative": Mutant(
         "steps/landing.py",
-        "end = self.jumps[index] - (jump - place)",
+        "end = known[index] - (jump - place)",
         "end = place",
         "holding elements",
     ),
@@ -99,7 +101,7 @@ MUTANTS = {
     ),
     "grazing is not counted": Mutant(
         "steps/events.py",
-        "grazing=jnp.maximum(passed.missed, begun.grazing),",
+        "grazing=jnp.maximum(passed.missed, regime.grazing),",
         "grazing=passed.missed,",
         f"{SWITCHES}::test_a_motion_tells_of_its_switches",
     ),
@@ -125,7 +127,7 @@ MUTANTS = {
     ),
     "held joints drift": Mutant(
         "steps/loop.py",
-        "y1 = events.kept(begun, y1, y0)",
+        "y1 = events.kept(regime, y1, y0)",
         "pass",
         f"{HOLDING}::test_a_brake_holds_to_the_last_bit",
     ),
@@ -261,6 +263,45 @@ MUTANTS = {
         "acting = under_way[(k - self.late) % len(under_way)]",
         "acting = tau",
         f"{SAMPLED}::test_efforts_are_held_and_come_late",
+    ),
+    # Conditions
+    "what switches at once has no time": Mutant(
+        "steps/events.py",
+        "lambda: jnp.where(comes, 0, last.late),",
+        "lambda: jnp.zeros_like(t),",
+        f"{AT_ONCE}"
+        "::test_what_a_blow_switches_at_once_switches_at_the_time_of_the_blow",
+    ),
+    "a start on the zero is a passage": Mutant(
+        "steps/events.py",
+        "passed_zero = passed.switched & ~on_zero",
+        "passed_zero = passed.switched",
+        f"{RESETS}::test_where_a_reset_leaves_its_condition",
+    ),
+    "a run ends where its last step does": Mutant(
+        "steps/events.py",
+        "end, there = self._at_zero(t, y, args, which, ended & comes)",
+        "end, there = t, y",
+        f"{CONDITIONS}::test_a_fall_ends_on_the_floor",
+    ),
+    "a jump over a zero is a passage": Mutant(
+        "steps/events.py",
+        "end, there = self._at_zero(t, y, args, which, ended & comes)",
+        "end, there = self._at_zero(t, y, args, which, ended)",
+        f"{CONDITIONS}"
+        "::test_a_jump_that_carries_a_condition_over_its_zero_ends_the_motion_there",
+    ),
+    "what a reset turns round goes on": Mutant(
+        "steps/events.py",
+        "goes_on = jnp.sign(arrives) * jnp.sign(leaves) > 0",
+        "goes_on = leaves < 0",
+        EVER_FASTER,
+    ),
+    "resets count as fast as switches": Mutant(
+        "steps/landing.py",
+        "power = jnp.where(found.resets, _RESET_PACE, _PACE)",
+        "power = _PACE",
+        EVER_FASTER,
     ),
 }
 

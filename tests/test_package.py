@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from mutants import MUTANTS
 
 import fdof_jax as fj
 
@@ -167,3 +168,15 @@ def test_messages_show_values_through_one_function():
     allowed = {"__init__.py", "linkage.py"}
     showing = {path.name for path in FOLDER.rglob("*.py") if "!r}" in path.read_text()}
     assert showing == allowed
+
+
+def test_each_fault_of_mutants_has_its_place():
+    """`python tests/mutants.py` takes an hour: a name that changed shows here."""
+    for name, mutant in MUTANTS.items():
+        text = (FOLDER / mutant.file).read_text()
+        assert text.count(mutant.old) == 1, name
+        file, _, test = mutant.check.partition("::")
+        found = (
+            not test or f"def {test.partition('[')[0]}(" in (ROOT / file).read_text()
+        )
+        assert found, name
