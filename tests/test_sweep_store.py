@@ -396,3 +396,24 @@ def test_results_beyond_the_memory_go_to_a_store(tmp_path):
         assert data.q.nbytes + data.qd.nbytes > 320e6
         assert not data.failed.any()
         np.testing.assert_allclose(data.q[:, 0, 0], np.linspace(-1, 1, 6400))
+
+
+@pytest.mark.slow
+def test_each_member_is_in_its_own_row_in_whatever_order_they_are_solved(
+    tmp_path, monkeypatch
+):
+    """Chunks whose first and last rows are as far apart as if all were in order, too.
+
+    The fastest members are expected to take longest, and solved first.
+    """
+    monkeypatch.setattr(store, "_CHUNKS", 16)
+    orders = [0, 5, 2, 1, 3, 4], [3, 0, 5, 2, 1, 4], [5, 0, 3, 4, 2, 1]
+    arm = fj.scenes.double_pendulum().linkage
+    for number, order in enumerate(orders):
+        speeds = np.zeros((6, 2))
+        speeds[order, 0] = np.arange(9, 3, -1)
+        start = fj.State(np.zeros((6, 2)), speeds)
+        one = functools.partial(fj.sweep, arm, start, [0, 0.3], chunk=3)
+        with xarray.open_zarr(one(store=tmp_path / str(number))) as stored:
+            np.testing.assert_array_equal(stored.qd[:, 0], speeds)
+            np.testing.assert_array_equal(stored.q, one().q)

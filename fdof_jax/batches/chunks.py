@@ -356,7 +356,7 @@ def in_chunks(
                     return jax.device_put(whole) if on_device else whole
                 results = [np.empty((size, *v.shape[1:]), v.dtype) for v in values]
             rows = place[members]
-            if rows[-1] - rows[0] == len(rows) - 1:  # a slice is faster
+            if (np.diff(rows) == 1).all():  # a slice is faster
                 rows = slice(rows[0], rows[-1] + 1)
             for result, value in zip(results, values):
                 result[rows] = np.asarray(value)[: len(members)]
