@@ -5,7 +5,7 @@ branches in force at its start, so that the equations of the step are smooth, an
 where a switching function changes its sign.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 
@@ -25,7 +25,7 @@ class Switches:
     `sides` (n,): 1 above and -1 below zero, 0 for the function's own sign; None stands
     for zeros.
     `values`: the switching functions as they were met; `jumping`: with which of their
-    entries something jumps.
+    entries efforts jump, None for those of conditions.
     """
 
     def __init__(self, sides: Array | None):
@@ -51,7 +51,7 @@ class Switches:
         begin, self._count = self._count, self._count + count
         return slice(begin, self._count)
 
-    def add(self, values: list[Array], jumping: list[bool]) -> None:
+    def add(self, values: list[Array], jumping: Sequence[bool | None]) -> None:
         """Adds switches that were met elsewhere, with the sides of `rest`."""
         self.values += values
         self.jumping += jumping

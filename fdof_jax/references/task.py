@@ -122,10 +122,10 @@ class TipReference(Reference):
         motion = super().__call__(t, linkage)
         if not (is_traced(motion) or np.isfinite(motion).all()):
             check_moving_joints(linkage, self.orientation is not None)
-            tip = np.round(self.tip(t), 6)
+            tip = ", ".join(f"{x:.6g}" for x in self.tip(t))
             raise ValueError(
                 f"t: expected a time at which the tip is within {self._reach()}, got "
-                f"{np.asarray(t):g} s, at which it is at {tip.tolist()} m"
+                f"{np.asarray(t):g} s, at which it is at [{tip}] m"
                 f"{self._beyond(linkage, t)}."
             )
         return motion

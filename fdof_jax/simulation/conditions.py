@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 
 from ..base.checks import function, one_of, refusal
 from ..forces.element import Element, Forces, element_of
-from ..forces.reset import Reset, condition, resets_in
+from ..forces.reset import Reset, condition
 from ..linkage.linkage import Linkage
 
 _EXPECTED = "a function (t, q, qd, linkage) that returns a number"
@@ -93,13 +93,9 @@ def conditions(until: Any) -> tuple[Until, ...]:
     )
 
 
+CONDITIONS = Reset, Until  # of which steps know the switching functions
+
+
 def conditions_in(forces: Forces) -> tuple[Until, ...]:
     """Returns the conditions among elements."""
     return tuple(element for element in forces if isinstance(element, Until))
-
-
-def conditions_last(forces: Forces) -> Forces:
-    """Returns elements in their order, but those with conditions after the others."""
-    kinds = Reset, Until
-    others = (element for element in forces if not isinstance(element, kinds))
-    return (*others, *resets_in(forces), *conditions_in(forces))

@@ -10,14 +10,13 @@ import numpy as np
 from jax import Array
 from jaxtyping import PyTree
 
-from ..base.checks import place_of
 from ..forces.element import Element, ForeignElement, OwnStates
 from ..forces.holders import JointFriction, holders
 from ..forces.reset import Reset
 from ..linkage.linkage import Linkage, joint_names, moving_joints
 from ..mechanics.kinematics import tip_jacobian
 from ..steps.derivative_control import linearised
-from .conditions import Until, conditions_last
+from .conditions import Until
 from .field import (
     args_of,
     effort_and_switches,
@@ -78,9 +77,7 @@ def _of_switches(inputs: Inputs, keywords: Settings) -> str:
     names, begin = joint_names(linkage), 0
     switched = np.asarray(eqx.filter_jit(last_switched)(inputs, keywords))
     own = own0 or initial_states(linkage, forces)
-    by_place = {k: (e, state) for k, e, state in with_states(forces, own)}
-    for k in (place_of(e, forces) for e in conditions_last(forces)):
-        element, state = by_place[k]
+    for k, element, state in with_states(forces, own):
 
         def functions(q, qd, k=k, element=element, state=state):
             at = ts[0], q, qd, linkage, state

@@ -38,7 +38,7 @@ from ..mechanics.equations import (
 from ..mechanics.rates import conditioning, rates, rates_and_conditioning
 from ..mechanics.solve import divided, minus, solver_of, times, with_added
 from ..steps.term import Health, Integrated, health_if
-from .conditions import Until
+from .conditions import CONDITIONS, Until
 from .prescribed import prescribed
 from .sampling import Sampler, unsampled
 
@@ -215,7 +215,8 @@ def efforts(
             effort, rate, values, jumping = effort_and_switches(
                 index, element, *at, state, switches.rest()
             )
-            switches.add(values, jumping)
+            known = isinstance(element, CONDITIONS)  # whose own function is its last
+            switches.add(values, [*jumping[:-1], None] if known else jumping)
             own_rates += _scalars(rate, args.q0.dtype)
         tau = effort if tau is None else tuple(a + b for a, b in zip(tau, effort))
     tau = zeros(args.q0) if tau is None else tuple(tau)

@@ -18,7 +18,7 @@ from ..base.known_values import known_array
 from ..base.trees import constant
 from ..forces.element import Element, OwnStates
 from ..forces.joints import EffortHistory
-from ..forces.reset import resets_in
+from ..forces.reset import Reset
 from ..linkage.linkage import Linkage, possible, without_fixed
 from ..steps import loop
 from ..steps.derivative_control import ProbeJudge, TangentJudge
@@ -30,7 +30,7 @@ from ..steps.looped_dopri8 import LoopedDopri8
 from ..steps.term import Integrated
 from ..steps.tolerances import default_controller, error_control_of, with_tolerances
 from .arrays import in_arrays
-from .conditions import End, conditions_in, conditions_last
+from .conditions import CONDITIONS, End, conditions_in
 from .events import in_order
 from .field import args_of, initial_own, own_states
 from .formulation import clocks_apart, joints_at, known_times, start_of, term_of
@@ -116,7 +116,6 @@ def _prepare(
     q0, qd0 = (without_fixed(linkage, jnp.where(wrong_start, 0, a)) for a in state0)
     stand_in = 1e-3 * jnp.arange(len(ts), dtype=ts.dtype)
     ts = jnp.where(wrong_times, stand_in, ts)
-    forces = conditions_last(forces)  # so that their switches are known
     args = args_of(linkage, q0, forces)
     if derivatives:
         args = clocks_apart(args, ts)
@@ -157,10 +156,9 @@ def _scheme(
         watches = not isinstance(method, ScheduledDopri8)  # which finds it itself
         control = error_control_of(controller)
         judge = Judge(control, term, watches, of_derivatives)
-        directions = lambda kind: tuple(one.direction for one in kind)
-        resets = directions(resets_in(args.forces))
-        ends = directions(conditions_in(args.forces))
-        events = events_of(term, ts, start, args, (resets, ends), derivatives)
+        met = [e for e in args.forces if isinstance(e, CONDITIONS)]
+        conditions = [(isinstance(e, Reset), e.direction) for e in met]
+        events = events_of(term, ts, start, args, conditions, derivatives)
         lands = events is not None or motion.jumps is not None
     else:
         lands = False

@@ -1,5 +1,6 @@
 """The results of a simulation: motions, with their outcomes."""
 
+import itertools
 from collections.abc import Iterable
 from typing import Any
 
@@ -45,6 +46,7 @@ HAPPENINGS = (
     "sticks", "slips", "bounces", "rests on its stop", "leaves its stop",
     "is braked", "is let go", "is stopped", "is reset",
 )  # fmt: skip
+_MOST_SHOWN = 8  # events in a line
 # Slower crossings are near to grazing, where no derivative exists.
 SLOW = 0.01
 
@@ -110,6 +112,18 @@ class Events(eqx.Module):
         columns = {"t [s]": t[there], "joint": joint[there].astype(int), "event": words}
         batch = np.nonzero(there)[:-1]
         return dict(zip(("motion",), batch)) | columns
+
+    def __repr__(self) -> str:
+        """The first events of one motion, or shapes."""
+        if is_traced(self.count) or np.ndim(self.count):
+            return super().__repr__()
+        rows = zip(*self.table.values())
+        words = [
+            f"{t:.4g} s: {f'joint {joint}' if joint else 'the state'} {event}"
+            for t, joint, event in itertools.islice(rows, _MOST_SHOWN)
+        ]
+        more = [] if self.count <= len(words) else ["..."]
+        return f"Events({'; '.join([f'{self.count:.0f} events', *words, *more])})"
 
 
 class Solution(eqx.Module):

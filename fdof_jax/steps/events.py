@@ -113,19 +113,19 @@ class Events(eqx.Module):
     Where efforts jump at a switch, a motion that starts on it, or meets it together
     with another, may have different derivatives on its two sides.
 
-    - `jumping`: whether efforts jump where each function switches; the last `guards`
-      functions guard modes.
-    - `ends`: of the functions just before them, which end the run: in which direction
-      each does, 0 for both. `resets`: the same of those before, which reset the state.
+    - `jumping`: whether efforts jump where each function switches; None of conditions.
+      The last `guards` functions guard modes.
+    - `resets`, `ends`: of the conditions that reset the state, and that end the run,
+      the places among the functions, and directions: 0 for both.
     - `derivatives`: whether states move with the times of events, in derivatives.
     """
 
     term: Any
     apart: Array  # see `clearance`
-    jumping: tuple[bool, ...] = eqx.field(static=True)
+    jumping: tuple[bool | None, ...] = eqx.field(static=True)
     guards: int = eqx.field(static=True)
-    resets: tuple[int, ...] = eqx.field(static=True)
-    ends: tuple[int, ...] = eqx.field(static=True)
+    resets: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    ends: tuple[tuple[int, int], ...] = eqx.field(static=True)
     derivatives: bool = eqx.field(static=True)
 
     def start(self, t0: Array, args: Arguments) -> Switches:
@@ -212,10 +212,9 @@ class Events(eqx.Module):
             there = moved(late, time, y, before, self.term)
         if self.resets:
             resets = last.resets & jumped
-            which = self._places(len(self.resets), len(self.ends)).start
-            at, there = self._at_zero(
-                t, there, before, which + jnp.argmax(resets), resets.any() & comes
-            )
+            which = _places(self.resets)[jnp.argmax(resets)]
+            near = resets.any() & comes
+            at, there = self._at_zero(t, there, before, which, near)
         arrived_as = there, before
         own = before._replace(sides=sides)
         event = Event(last.until, at, fired, late, resets)
@@ -229,21 +228,6 @@ class Events(eqx.Module):
             there = moved(-late, t + late, there, after, self.term)
         return there, modes, sides, late
 
-    def _places(self, count: int, later: int) -> slice:
-        """Returns the places of `count` functions before `later` ones and guards."""
-        last = len(self.jumping) - self.guards - later
-        return slice(last - count, last)
-
-    def _met(
-        self, directions: tuple[int, ...], later: int, passed: Array, after: Array
-    ) -> Array:
-        """Returns which conditions are met, (condition,).
-
-        `passed`: which functions passed a zero; `after`: all sides then.
-        """
-        own, wanted = self._places(len(directions), later), np.array(directions)
-        return passed[own] & ((wanted == 0) | (wanted == after[own]))
-
     def _sides_after(
         self, t: Array, before: tuple[Integrated, Arguments],
         after: tuple[Integrated, Arguments], resets: Array, last: Switches,
@@ -253,7 +237,7 @@ class Events(eqx.Module):
         It goes on unless the reset turns its rate round, or stops it: then it is to be
         reset again. `before`, `after`: states and arguments at the time of the reset.
         """
-        own = self._places(len(self.resets), len(self.ends))
+        own = _places(self.resets)
 
         def at(state: tuple[Integrated, Arguments]) -> tuple[Array, Array]:
             y, args = state
@@ -340,7 +324,7 @@ class Events(eqx.Module):
         passed_zero = passed.switched & ~on_zero
         resets = None
         if self.resets:
-            resets = self._met(self.resets, len(self.ends), passed_zero, after)
+            resets = _met(self.resets, passed_zero, after)
         found = Found(
             until=until,
             unseen=jnp.where(passed.unseen < 1, t0 + passed.unseen * h, t1),
@@ -375,7 +359,7 @@ class Events(eqx.Module):
         """
         if not self.ends:
             return None
-        met = self._met(self.ends, 0, passed, after)
+        met = _met(self.ends, passed, after)
         return jnp.where(met.any(), jnp.argmax(met), -1)
 
     def at_end(
@@ -389,7 +373,7 @@ class Events(eqx.Module):
         args = args._replace(sides=last.sides, modes=last.modes)
         assert last.ended is not None
         ended, comes = last.ended >= 0, last.length > 0
-        which = self._places(len(self.ends), 0).start + last.ended
+        which = _places(self.ends)[last.ended]
         end, there = self._at_zero(t, y, args, which, ended & comes)
         if last.late is None:
             return end, there
@@ -432,12 +416,26 @@ class Events(eqx.Module):
         """Returns `Switches.one_sided` at the end of a step."""
         if last.one_sided is None:
             return None
-        jumping = np.array(self.jumping)
+        jumping = np.array(self.jumping, bool)
         at_once = jumping & on_zero & (sizes > 0) & (regime.sides != 0)
         at_once = jnp.any(at_once[: sizes.size - self.guards])
         several = jnp.sum(regime.changed & jumping) > 1
         together = several & (last.grazing_here > 0)
         return jnp.maximum(last.one_sided, at_once) + together
+
+
+def _places(conditions: tuple[tuple[int, int], ...]) -> Array:
+    return jnp.array([place for place, _ in conditions])
+
+
+def _met(conditions: tuple[tuple[int, int], ...], passed: Array, after: Array) -> Array:
+    """Returns which conditions are met, (condition,).
+
+    `passed`: which functions passed a zero; `after`: all sides then.
+    """
+    places = _places(conditions)
+    wanted = jnp.array([direction for _, direction in conditions])
+    return passed[places] & ((wanted == 0) | (wanted == after[places]))
 
 
 def _along(y: Integrated, time: Array, rates: Integrated) -> Integrated:
@@ -446,11 +444,11 @@ def _along(y: Integrated, time: Array, rates: Integrated) -> Integrated:
 
 def events_of(
     term: Term, ts: Array, y0: Integrated, args: Arguments,
-    conditions: tuple[tuple[int, ...], tuple[int, ...]], derivatives: bool,
+    conditions: list[tuple[bool, int]], derivatives: bool,
 ) -> Events | None:  # fmt: skip
     """Returns the events of a run over the times `ts`, None if nothing switches.
 
-    `conditions`: see `Events.resets` and `Events.ends`.
+    `conditions`: whether each resets the state, else it ends the run; its direction.
     """
     guards = 0
     if term.unknown_modes is not None:
@@ -459,7 +457,12 @@ def events_of(
     functions, jumping = eqx.filter_eval_shape(term.switches, ts[0], y0, args)
     if not functions.size:
         return None
-    return Events(term, clearance(ts), jumping, guards, *conditions, derivatives)
+    places = [place for place, jumps in enumerate(jumping) if jumps is None]
+    resets, ends = (
+        tuple((k, way) for k, (one, way) in zip(places, conditions) if one == resets)
+        for resets in (True, False)
+    )
+    return Events(term, clearance(ts), jumping, guards, resets, ends, derivatives)
 
 
 @eqx.filter_jit  # traced once, not at each use in a solve

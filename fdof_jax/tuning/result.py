@@ -130,7 +130,9 @@ class TuneResult(Report):
         comparisons = [("loss", first.loss[0], last.loss[-1])]
         if np.isfinite(self.tip_error):
             error = first.tip_error[0], last.tip_error[-1]
-            comparisons.append(("rms tip error [mm]", 1e3 * error[0], 1e3 * error[1]))
+            of = " of all members" if len(self.member_loss) > 1 else ""
+            label = f"rms tip error{of} [mm]"
+            comparisons.append((label, 1e3 * error[0], 1e3 * error[1]))
         shares = 100 * first.saturated[0], 100 * last.saturated[-1]
         for name, *share in zip(joint_names(self.scene.linkage), *shares):
             comparisons.append((f"{name} at its limit [%]", *share))
