@@ -152,6 +152,8 @@ def test_recipes(tmp_path, monkeypatch):
     push = names["fj"].forces.EffortHistory(np.linspace(0, 2.5, 26), names["efforts"])
     upright = names["fj"].simulate(names["cart"], names["down"], [0, 2.5], (push,))
     np.testing.assert_allclose(upright.q[-1], [0, np.pi], atol=1e-6)
+    np.testing.assert_allclose(np.exp(names["fastest"].x[0]), 1, rtol=1e-6)
+    np.testing.assert_allclose(names["steady"].q[-1], names["upright"], atol=1e-6)
     assert 0.0220 < (2 * names["best"].cost) ** 0.5 < 0.0226  # the controller: 0.0501
     np.testing.assert_allclose(names["state"].q, names["upright"], atol=1e-2)
     assert (names["result"] == names["diffrax"].RESULTS.successful).all()

@@ -12,6 +12,7 @@ import pytest
 from helpers import random_linkage, random_motion
 
 import fdof_jax as fj
+from fdof_jax.linkage.frames import scalar_frames
 
 A, B = fj.Point(0, 0.3, -0.4), fj.Point(3, 0.5, 0.2)
 
@@ -151,3 +152,13 @@ REFUSED = {
 def test_malformed_arguments_are_refused(message):
     with pytest.raises(ValueError, match=f"^{message}"):
         REFUSED[message]()
+
+
+@pytest.mark.parametrize("topology", fj.TOPOLOGIES)
+def test_velocities_of_points_are_derivatives_of_their_positions(topology):
+    arm = random_linkage(topology, np.random.default_rng(1))
+    q, qd = jnp.array([0.3, 1.2, -0.4]), jnp.array([0.5, -0.3, 0.7])
+    point = fj.Point(3, 0.7, 0.2)
+    velocity = point.velocity(scalar_frames(arm, tuple(q)), tuple(qd))
+    _, expected = jax.jvp(lambda q: point.position(arm, q), (q,), (qd,))
+    np.testing.assert_allclose([velocity.real, velocity.imag], expected, rtol=1e-12)

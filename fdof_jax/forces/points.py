@@ -84,11 +84,18 @@ class Point(Part):
         start, direction = (pick(self.link, rows) for rows in frames[:2])
         return start + offset * direction
 
+    def velocity(self, frames: Frames, qd: Scalars) -> Complex[Array, ""]:
+        """Computes the point's velocity x + iy [m/s]."""
+        # A unit force has the power of the velocity along it.
+        along_x, along_y = (Load(self, force).efforts(frames) for force in (1, 1j))
+        rows = ((x + 1j * y) * rate for x, y, rate in zip(along_x, along_y, qd))
+        return reduce(add, rows)
+
 
 class Load(NamedTuple):
     """A force and a moment on a point.
 
-    - `force`: (x, y) [N]; `moment`: counter-clockwise [N m].
+    - `force`: (x, y), or x + iy [N]; `moment`: counter-clockwise [N m].
     """
 
     point: Point
@@ -126,16 +133,19 @@ class PointElement(ScalarElement):
     """A force element that acts on points of links or of the ground.
 
     A subclass implements `loads` [N and N m]. The bearings carry these loads, unlike
-    efforts in the joints: see `joint_reactions`.
+    efforts in the joints: see `joint_reactions`. In `loads`, `frames` says where links
+    are: `point.place(frames)` is a point's position, `point.velocity(frames, qd)` its
+    velocity, both as complex numbers x + iy [m, m/s]. A force may be one, too.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
-    >>> class Weight(fj.forces.PointElement):
+    >>> class Drag(fj.forces.PointElement):
     ...     def loads(self, scheduled, frames, qd):
     ...         tip = fj.Point(3, 1.0)
-    ...         return (fj.forces.Load(tip, force=(0, -10)),)  # downwards
-    >>> Weight()(0.0, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], arm).tolist()
-    [-30.0, -20.0, -10.0]
+    ...         v = tip.velocity(frames, qd)
+    ...         return (fj.forces.Load(tip, force=-2 * abs(v) * v),)
+    >>> Drag()(0.0, [0.0, 0.0, 0.0], [1.0, 0.0, 0.0], arm).tolist()  # 3 m/s upwards
+    [-54.0, -36.0, -18.0]
     """
 
     @abstractmethod

@@ -109,7 +109,10 @@ def _search(
         for problem in failed[0]:
             scene = problem.scene_at(unknowns.named(unknowns.start))
             check_motion("scene_at(...)", scene, problem.ts)
-        expected = "parameters at which the motion and its derivatives are finite"
+        expected = (
+            "parameters at which the motion and its derivatives are finite (a norm of "
+            "0 has none)"
+        )
         raise refusal("start", expected, start)
     evaluated = [None] * len(runs)
     if held_out:

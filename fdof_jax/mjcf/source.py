@@ -188,6 +188,6 @@ def _as_in_ros(robot: Node) -> list[str]:
             robot.insert(0, ElementTree.Element("link", name=name))
             declared.add(name)
             remarks.append(f"link world added, {where}")
-    if any("velocity" in limit.attrib for limit in robot.iter("limit")):
-        remarks.append("left out: limits of velocities")
+    if any({"velocity", "effort"} & {*limit.attrib} for limit in robot.iter("limit")):
+        remarks.append("left out: limits of velocities and efforts")
     return list(dict.fromkeys(remarks))
