@@ -98,7 +98,7 @@ def done():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("words", ["holds on 17 scenes", "tuned"])
+@pytest.mark.parametrize("words", ["holds on 18 scenes", "tuned"])
 def test_single_precision(words, done):
     assert words in done.stdout, done.stderr[-3000:]
 
