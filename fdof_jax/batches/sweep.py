@@ -162,8 +162,8 @@ def sweep(
 ) -> Any:
     """Computes many motions, as `jax.vmap(simulate)` does, but faster.
 
-    A member that fails ends early with a result of its own, and slow members delay few
-    others. Runs on all devices of this process.
+    A member that fails ends early with its own result, and a slow member delays few
+    others. `sweep` runs on all devices of this process.
 
     **Arguments:**
 
@@ -174,28 +174,28 @@ def sweep(
     - `forces`: force elements; `forces_axes`: which of their arrays carry the batch
       axis, as `in_axes` of `jax.vmap`: 0 for all, None (the default) for none, or a
       tuple of these with one entry per element.
-    - `reduce`: a function of one member, as a `Scene` with its own numbers, and of its
-      `Solution`, for instance `lambda scene, motion: motion.q[-1]`, or a loss of
-      `tune`; of each member only the arrays that it returns are kept. Functions of
-      equal code share a compiled program.
+    - `reduce`: a function of one member's `Scene` and `Solution`, for instance `lambda
+      scene, motion: motion.q[-1]`, or a loss of `tune`. Of each member, only the arrays
+      that it returns are kept. Functions of equal code share a compiled program.
     - `chunk`: largest number of members to solve together, per device; None stands for
       256, or 64 where elements hold joints.
     - `throw`: whether to raise an error if any member fails.
-    - `store`: a folder for the results, which are not held in memory: a Zarr group for
-      `xarray.open_zarr`, written in blocks of members (`fdof_jax[data]` brings zarr). A
-      repeated call solves only the blocks that are missing or damaged; a warning names
-      damaged files. A folder with another sweep, or anything else, is refused.
+    - `store`: a folder for the results, which are then not held in memory. It is a Zarr
+      group for `xarray.open_zarr`, written in blocks of members (`fdof_jax[data]`
+      installs zarr). A repeated call solves only missing or damaged blocks; a warning
+      names damaged files. A folder that holds another sweep, or anything else, is
+      rejected.
     - `shard`, `of`: with `store`, solves only each block whose number is `shard` modulo
       `of`. Any number of processes may fill one store, in any order.
     - `solver`, `rtol`, `atol`, `max_step`, `stepsize_controller`, `dt0`, `adjoint`,
       `max_steps`, `progress_meter`: as in `simulate`.
 
     **Returns:** a `Solution` with a leading batch axis everywhere; `result` reports how
-    each member ended. With `reduce`, what that returns, with a leading batch axis:
-    NaN, or a `motion.result` in it, marks members that failed. Under `jax.grad` or
-    another transformation a failed member adds nothing to any derivative, and
-    `solution.result == diffrax.RESULTS.successful` selects the members that count.
-    Finding them takes one more solve, without derivatives. With `store`, its path.
+    each member ended. With `reduce`, the arrays that it returns, with a leading batch
+    axis: NaN, or a `motion.result` among them, marks failed members. With `store`, its
+    path. Under `jax.grad` or another transformation a failed member adds nothing to any
+    derivative, and `solution.result == diffrax.RESULTS.successful` selects the members
+    that count. Finding these members takes one more solve, without derivatives.
 
     **Raises:** ValueError for malformed arguments; RuntimeError, with `throw=True`, if
     a member fails; ImportError, with `store`, where zarr is not installed.

@@ -1,4 +1,4 @@
-"""A scene as a term of diffrax, for a solve of one's own."""
+"""Converts a scene to a term of diffrax, for your own solve."""
 
 from typing import Any
 
@@ -22,23 +22,23 @@ _Y = tuple[Array, Array, Array]  # positions, velocities, states of elements
 def ode_term(scene: Scene) -> tuple[diffrax.ODETerm, _Y, Args]:
     """Returns a scene as the term, start and arguments of a `diffrax.diffeqsolve`.
 
-    `diffrax.diffeqsolve(term, solver, 0, t1, dt0, y0, args)` then has what `simulate`
-    has not: dense solutions, events that end a solve, and noise by a `MultiTerm` (see
-    the recipes). It lacks what `simulate` adds: steps do not end where elements jump or
-    switch, so that derivatives there may be wrong; errors that are mere rounding
-    shorten steps; no result names a singular arm.
+    `diffrax.diffeqsolve(term, solver, 0, t1, dt0, y0, args)` offers what `simulate`
+    does not: dense solutions, diffrax's events, and noise by a `MultiTerm` (see the
+    recipes). It lacks what `simulate` adds. Steps do not end where elements jump or
+    switch, and derivatives there may be wrong. Mere rounding errors shorten steps. No
+    result reports a singular arm.
 
     **Arguments:**
 
-    - `scene`: its linkage, start and forces. Elements that hold joints, a `Payload`
-      that arrives, and a `PrescribedMotion` are refused: only `simulate` knows their
-      blows.
+    - `scene`: its linkage, start and forces are used. Elements that hold joints, a
+      `Payload` that arrives, and a `PrescribedMotion` are rejected: only `simulate`
+      computes their blows.
 
     **Returns:** `(term, y0, args)`. `term` is a `diffrax.ODETerm` of one function for
     all scenes, so that scenes of one structure share a program. `y0` is `(q, qd, own)`:
-    positions (n,) [m or rad], velocities (n,), and in one array (m,) the numbers of the
-    elements' own states, in their order. `args` holds the linkage and the forces.
-    `term.vf(t, y, args)` are the rates of `y`.
+    positions (n,) [m or rad], velocities (n,), and the elements' own states, in order,
+    in one array (m,). `args` holds the linkage and the forces. `term.vf(t, y, args)`
+    returns the rates of `y`.
 
     **Raises:** ValueError for malformed scenes.
 

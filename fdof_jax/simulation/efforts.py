@@ -64,7 +64,7 @@ def acting_in(motion: Solution, forces: tuple[Element, ...]) -> tuple[Element, .
 def joint_efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Efforts:
     """Computes the joint efforts of the force elements along a motion.
 
-    **Arguments:** the linkage, the forces and the solution of one `simulate`; of
+    **Arguments:** the linkage, the forces and the solution of one `simulate`. For
     `simulate_sampled`, the forces are `(control, *forces)`. A `Scene` may stand for
     linkage and forces: `joint_efforts(scene, solution)`.
 

@@ -40,9 +40,9 @@ class PrescribedMotion(Element):
     reference's, the motion starts with an impulse, and its first velocities are those
     after it.
 
-    Joints that stick, hit stops or are braked may stand beside it. At a prescribed
-    joint itself friction takes effort, but is not counted in `Solution.taken`; stops
-    and brakes there are refused.
+    Other joints may stick, hit stops or be braked. Friction at a prescribed joint adds
+    to its effort but is not counted in `Solution.taken`; stops and brakes there are
+    rejected.
 
     **Arguments:**
 

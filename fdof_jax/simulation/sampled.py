@@ -131,19 +131,19 @@ def simulate_sampled(
     - `forces`: other force elements.
     - `t0`: time of the first sample [s].
     - `delay`: time from measurement to action [s], which may be longer than a period.
-      The effort is zero until the first command acts. The motion has a kink where the
-      delay is a whole number of periods; derivatives there are those of longer delays.
-      Each number of whole periods takes a program of its own, all traced delays take
-      one. A traced delay below 0 ends the motion as not finite.
+      The effort is zero until the first command acts. As a function of the delay, the
+      motion has a kink at each whole number of periods; derivatives there are those of
+      longer delays. Each number of whole periods compiles its own program; all traced
+      delays share one. A traced delay below 0 ends the motion as not finite.
     - `noise`: standard deviations of the measured positions and velocities (each (n,)
       or one for all), with a `jax.random` `key`.
     - `options`: keywords of `simulate`; by default `max_steps` is 65536 and 64 more per
       sample.
 
-    **Returns:** a `Solution` at the sampling times, the end included, with `tau`.
-    Pictures, tables, `joint_efforts` and `joint_reactions` take `(control, *forces)` as
-    its `forces`, the controller first. The controller's efforts are then those that
-    act, 0 before the first command has arrived.
+    **Returns:** a `Solution` at the sampling times, the end included, with `tau`. For
+    pictures, tables, `joint_efforts` and `joint_reactions`, its `forces` are `(control,
+    *forces)`, the controller first. The controller's efforts are then those that act: 0
+    before the first command arrives.
 
     **Raises:** ValueError for malformed arguments.
 

@@ -60,10 +60,10 @@ class OfScene(Protocol[_Arguments, _Result]):
 def accepts_scene(
     function: Callable[_Arguments, _Result],
 ) -> OfScene[_Arguments, _Result]:
-    """Decorates a function to accept a `Scene` in place of the arguments it holds.
+    """Decorates a function to accept a `Scene` in place of the scene's parts.
 
-    These are `linkage`, `state0` (or `state`), `forces` and `t1`. Others follow in
-    their order.
+    The parts are the arguments `linkage`, `state0` (or `state`), `forces` and `t1`.
+    Other arguments follow in their order.
 
     >>> import fdof_jax as fj
     >>> @fj.simulation.accepts_scene

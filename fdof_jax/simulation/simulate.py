@@ -176,28 +176,29 @@ def simulate(
 ) -> Solution:
     """Computes the motion of a linkage from `state0` at `ts[0]`, at the times `ts`.
 
-    The motion follows the paper's masked equations (17)-(27) in their reduced form. It
-    is a pure function, differentiable in every array and batched by `jax.vmap`; one
-    compilation serves all topologies.
+    The equations of motion are the paper's masked equations (17)-(27), reduced.
+    `simulate` is a pure function, differentiable in every array and batched by
+    `jax.vmap`. One compilation serves all topologies.
 
     **Arguments:**
 
     - `linkage`, `state0`: the arm, and its joint positions and velocities. A
       `Scene` may stand for linkage, state0 and forces: `simulate(scene, ts)`.
     - `ts`: increasing output times, of shape (time,) [s]. A step ends at the last time.
-      States between are interpolated and may be hundreds of times less exact;
+      States before it are interpolated and may be hundreds of times less exact;
       `diffrax.ClipStepSizeController` makes steps end at all of `ts`.
     - `forces`: a tuple of force elements `(t, q, qd, linkage) -> tau`.
-    - `until`: what ends the motion before `ts[-1]`: a function `(t, q, qd, linkage) ->
-      number`, where it passes 0; a `simulation.Until`, which tells the direction; or
-      several in a tuple. `Solution.end` is exact and has derivatives.
+    - `until`: a condition that ends the motion before `ts[-1]`, or a tuple of several.
+      A function `(t, q, qd, linkage) -> number` ends it where the number passes 0; a
+      `simulation.Until` adds the direction. `Solution.end` is exact and has
+      derivatives.
     - `own0`: initial states of the `StatefulElement`s among the forces, one row of a
       `Solution.own`; by default each element's `initial_state`.
     - `rtol`, `atol`: relative and absolute tolerance of a step, by default 1e-11 in
-      float64 and 1e-5 in float32; not allowed beside a `stepsize_controller`.
-    - `max_step`: longest step [s], by default none. It serves efforts with features so
-      brief that adaptive steps would pass over them. Not allowed beside a
-      `stepsize_controller`, which has one of its own (`dtmax`).
+      float64 and 1e-5 in float32; not allowed with a `stepsize_controller`.
+    - `max_step`: longest step [s], by default unlimited. Set it for efforts so brief
+      that adaptive steps would pass over them. Not allowed with a
+      `stepsize_controller`, which has its own (`dtmax`).
     - `solver`, `stepsize_controller`, `dt0`, `adjoint`, `max_steps`, `throw`,
       `progress_meter`: as in `diffrax.diffeqsolve`. The default solver and controller,
       also selected by `None`, are Dopri8 and adaptive steps. The first step `dt0` is
@@ -208,8 +209,8 @@ def simulate(
     **Returns:** a `Solution`. With `throw=False` its `result` reports a failed solve,
     and states that were not reached are NaN.
 
-    **Raises:** ValueError for malformed arguments; with `throw=True`, if the solve
-    fails, what the force elements' own `check(linkage, ts)` raises, or a RuntimeError.
+    **Raises:** ValueError for malformed arguments. With `throw=True`, a failed solve
+    raises the error of a force element's `check(linkage, ts)`, or else a RuntimeError.
     Warns in float32 if the tolerance cannot be met.
 
     >>> import fdof_jax as fj

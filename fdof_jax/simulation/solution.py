@@ -84,15 +84,15 @@ def outcome_numbers(result: diffrax.RESULTS) -> Array | np.ndarray:
 
 
 class Events(eqx.Module):
-    """The last 64 events of joints that elements hold: to which, when and what.
+    """The last 64 events of joints that elements hold: when, where and what.
 
-    - `t`: times [s]; `joint`: numbers of joints, from 1; `kind`: places of the words in
-      `table`. Each has an entry per event, NaN beyond the last one. Resets of the state
-      have the joint 0.
+    - `t`: times [s]; `joint`: numbers of joints, from 1, or 0 for a reset of the state;
+      `kind`: codes of the words in `table`. Each has an entry per event, NaN beyond the
+      last one.
     - `count`: how many there were in all.
-    - `table`: a dictionary of columns, "t [s]", "joint" and "event". The words of the
-      last are sticks, slips, bounces, rests on its stop, leaves its stop, is braked, is
-      let go, is stopped, is reset.
+    - `table`: a dictionary of columns, "t [s]", "joint" and "event". An event is one
+      of: sticks, slips, bounces, rests on its stop, leaves its stop, is braked, is let
+      go, is stopped, is reset.
     """
 
     t: Float[Array, " event"]
@@ -104,7 +104,7 @@ class Events(eqx.Module):
     def table(self) -> dict[str, np.ndarray]:
         """The events as columns, for instance for `pandas.DataFrame`.
 
-        Of a batch, the first column tells the motion.
+        For a batch, the first column, "motion", is the motion's place in it.
         """
         t, joint, kind = map(np.asarray, (self.t, self.joint, self.kind))
         there = np.isfinite(t)
@@ -131,47 +131,45 @@ class Solution(eqx.Module):
 
     - `ts`: output times [s].
     - `q`, `qd`: joint positions [m or rad] and velocities at `ts`; NaN after a failure.
-      Printed, a motion says if its positions are so large that their digits end before
-      the default tolerance, as angles that grow without end.
-    - `stats`: diffrax's statistics, `num_steps` among them; `time_reached` [s]; and,
-      with adaptive steps, `accuracy`: the rounding unit, 2.2e-16 in float64, over the
-      least of the `inertia_ratios` at the steps. It tells how many digits the equations
-      keep, and is no bound: accelerations have relative errors of that order, some
-      times as large, and larger in joints that accelerate less than others or where
-      efforts cancel. Steps do not chase errors below it. If elements switch, also
-      the number of switches, `num_switches`, and `slowest_crossing`: the least speed at
-      which a switching function passed its zero. It is relative to the function's size
-      in the step, or to the speed at which the function would turn back at its size. A
-      function that turns back within 1 % of its size before its zero counts as if it
-      had gone as far beyond. Near 0 a contact grazes, and the motion has no derivative.
-      If efforts jump at switches, `one_sided`: the number of places where derivatives
-      may hold on one side only, because the motion starts on a switch or meets two at
-      once.
+      A printed motion reports positions so large that their rounding exceeds the
+      default tolerance, such as angles that grow without end.
+    - `stats`: diffrax's statistics, such as `num_steps`, and `time_reached` [s].
+      Adaptive steps add `accuracy`: the rounding unit, 2.2e-16 in float64, over the
+      least of the `inertia_ratios` at the steps. Relative errors of accelerations are
+      of this order, but it is no bound: they may be several times as large, and larger
+      still in joints that accelerate less than others or where efforts cancel. Steps do
+      not chase errors below it. Elements that switch add `num_switches` and
+      `slowest_crossing`: the least speed at which a switching function passed its zero,
+      relative to the function's size in the step, or to the speed at which the function
+      would turn back at its size. A function that turns back within 1 % of its size
+      before its zero counts as if it had gone as far beyond. Near 0 a contact grazes,
+      and the motion has no derivative. Efforts that jump at switches add `one_sided`:
+      the number of places where derivatives may hold on one side only, because the
+      motion starts on a switch or meets two at once.
     - `result`: diffrax's result, one per trajectory: `diffrax.RESULTS.successful` or
       the reason for the failure. `outcome` states it in words.
     - `own`: the states of the `StatefulElement`s at `ts`, in the order of the forces;
       each like its `initial_state`, with a leading time axis.
 
-    If elements hold joints for a while (`JointFriction`, `HardStops`, `Brake`), take a
-    `Payload` or `Reset` the state, else None (the first `qd` are then those after blows
-    at the start):
+    With elements that hold joints (`JointFriction`, `HardStops`, `Brake`), a `Payload`
+    or a `Reset`, else None (the first `qd` are then those after blows at the start):
 
-    - `modes`: what holds each joint at `ts`, as numbers: 0 nothing, 1 friction, 2 its
-      lower stop, 3 its upper stop, 4 a brake. At the very time of an event it may be
-      the mode before it or after it.
-    - `taken`: energy that friction, blows, brakes, resets and the catching of payloads
-      have taken up to `ts` [J]; not that of a friction whose level is a function.
-    - `events`: what happened to which joint, and when; its times have derivatives.
+    - `modes`: what holds each joint at `ts`: 0 nothing, 1 friction, 2 its lower stop, 3
+      its upper stop, 4 a brake. At the very time of an event it may be the mode before
+      or after the event.
+    - `taken`: energy taken by friction, blows, brakes, resets and the catching of
+      payloads up to `ts` [J]. Friction whose level is a function is not counted.
+    - `events`: what happened to which joint, and when. The times have derivatives.
 
-    - `end`: with `until`, else None: where the motion ended, `end.t`, `end.q` and
-      `end.qd`, and the number of the condition that was met first, `end.condition`; -1
-      if none was, and the end is the last row. `ended` says whether one was. Rows after
-      the end are NaN.
+    - `end`: with `until`, else None: the time `end.t` and the state `end.q`, `end.qd`
+      at which the motion ended, and the number `end.condition` of the condition that
+      was met first. If none was met, `ended` is False, the number is -1 and the end is
+      the last row. Rows after the end are NaN.
 
     After `simulate_sampled`, else None:
 
-    - `tau`: efforts commanded at each sample (samples, n), 0 at fixed pairs
-      [N or N m]. Each acts from the delay after its sample until the next one acts.
+    - `tau`: efforts commanded at each sample (samples, n), 0 at fixed pairs [N or N m].
+      Each acts from its sample plus the delay until the next one acts.
     - `acting`: efforts that act at `ts`, or begin to act there [N or N m].
 
     >>> import fdof_jax as fj
@@ -204,7 +202,7 @@ class Solution(eqx.Module):
 
     @property
     def ended(self) -> Array:
-        """True where a condition of `until` ended the motion, one per trajectory."""
+        """True for each trajectory that a condition of `until` ended."""
         if self.end is None:
             return jnp.zeros(jnp.shape(self.q)[:-2], bool)
         return self.end.condition >= 0
@@ -213,16 +211,18 @@ class Solution(eqx.Module):
     def outcome(self) -> np.ndarray:
         """Outcome of each trajectory in words, an array of the batch's shape.
 
-        `"successful"`; `"ended"`: so, too, by a condition of `until`;
-        `"ill-conditioned"`: the mass matrix is singular or nearly so
-        (see `inertia_ratios`); `"not finite"`: the accelerations are not finite, as
-        those of a negative mass or of a reference out of reach (see
-        `references.reach_margin`);
-        `"out of steps"`; `"tolerance out of reach"`: rounding keeps even the shortest
-        step from meeting it; `"too many switches"`: one after the other, as between
-        branches that push towards each other; or `"solver failed"`.
+        - `"successful"`, or `"ended"`: successful, up to a condition of `until`.
+        - `"ill-conditioned"`: the mass matrix is singular or nearly so (see
+          `inertia_ratios`).
+        - `"not finite"`: the accelerations are not finite, for instance with a negative
+          mass or a reference out of reach (see `references.reach_margin`).
+        - `"out of steps"`, or `"solver failed"`.
+        - `"tolerance out of reach"`: rounding keeps even the shortest step from meeting
+          it.
+        - `"too many switches"`: endless ones, as between branches that push towards
+          each other.
 
-        Raises ValueError under transformations, where words do not exist.
+        Raises ValueError under JAX's transformations, where `result` has no words yet.
         """
         if is_traced(self.result):
             raise ValueError(
