@@ -40,7 +40,7 @@ _Part = TypeVar("_Part", bound="Part")
 
 
 class Values:
-    """The type of a declared array, which is given as any numbers."""
+    """The type of a declared array; constructors accept any numbers for it."""
 
     def __get__(self, part: object, owner: type | None = None) -> Array: ...
     def __set__(self, part: object, value: ArrayLike) -> None: ...
@@ -59,7 +59,7 @@ def field(
     default: Any = dataclasses.MISSING,
     kw_only: bool = False,
 ) -> Any:
-    """Declares a field of an element or a reference that is an array of real numbers.
+    """Declares an array of real numbers as a field of an element or a reference.
 
     Constructors and `simulate` raise ValueError for values out of bounds; if they are
     traced, the motion ends as not finite.
@@ -69,10 +69,11 @@ def field(
     - `shape`: by default one number per joint, or one for all (then `each` repeats it);
       `None` within it stands for any length, "joint" for the number of joints.
     - `unit`: for messages, for instance "N m s/rad".
-    - `minimum`, `above`: bounds; `finite`: whether infinities are refused.
-    - `function`: whether a function that returns such an array is accepted;
-      `optional`: whether None is, as it always is where it is the default.
-    - `rows`: of so many rows, each like `shape`, an array is accepted as well.
+    - `minimum`, `above`: lower bounds, with or without the bound itself; `finite`:
+      whether infinities are rejected.
+    - `function`: whether a function that returns such an array is accepted; `optional`:
+      whether None is accepted, as it is wherever it is the default.
+    - `rows`: an array of so many rows, each like `shape`, is accepted as well.
     - `default`, `kw_only`: as of `dataclasses.field`.
     """
     per_joint = shape is None
@@ -89,7 +90,7 @@ def called(expected: str) -> Any:
 
 
 def of_kind(kind: type, default: Any = dataclasses.MISSING) -> Any:
-    """Declares a field of an element: an instance of a class, or None if by default.
+    """Declares a field that is an instance of a class, or None if that is the default.
 
     The constructor raises ValueError for anything else.
 
@@ -124,8 +125,8 @@ class Condition(NamedTuple):
     """A condition on the values of an element or a reference: see `Element.conditions`.
 
     - `holds`: whether it is fulfilled: a bool, or an array whose entries must all be.
-    - `name`, `expected`: of the message if it is not; `got`: the value that the message
-      shows, or a tuple of several.
+    - `name`, `expected`: parts of the message if it is not; `got`: the value that the
+      message shows, or a tuple of several.
     """
 
     holds: Truth
@@ -159,11 +160,11 @@ class Part(Frozen, metaclass=_Fields):
     """
 
     def conditions(self) -> Iterable[Condition]:
-        """Yields conditions beside the bounds of fields; also of traced values."""
+        """Yields conditions besides the bounds of fields; values may be traced."""
         return ()
 
     def conditions_on(self, linkage: Linkage) -> Iterable[Condition]:
-        """Yields conditions on the arm's joints; parts within have their own."""
+        """Yields conditions on the arm's joints, without those of parts within."""
         return ()
 
     jump_ts = default(lambda self: jumps_of(dict(_within(self))))
@@ -184,19 +185,19 @@ class Part(Frozen, metaclass=_Fields):
         return real_array(name, value(*arguments), **rules)
 
     def check(self, linkage: Linkage, ts: Array) -> None:
-        """Raises ValueError unless it fits the arm and the times, all known."""
+        """Raises ValueError unless the part fits the arm and the times, all known."""
         for _, part in _within(self):
             part.check(linkage, ts)
 
     def fits(self, linkage: Linkage, ts: Array) -> Truth:
-        """Returns whether an arm and times would be accepted; also if traced."""
+        """Returns whether the part fits the arm and the times; all may be traced."""
         # NumPy's `all` of a traced array is the array's own.
         own = [np.all(condition.holds) for condition in self.conditions_on(linkage)]
         parts = [part.fits(linkage, ts) for _, part in _within(self)]
         return reduce(and_, [*own, *parts], True)
 
     def possible(self) -> Truth:
-        """Returns whether the constructor would accept the values; also if traced."""
+        """Returns whether the constructor would accept the values, known or traced."""
         own = [np.all(condition.holds) for condition in self.conditions()]
         fields = [within_bounds(value, **rules) for _, value, rules in _declared(self)]
         parts = [part.possible() for _, part in _within(self)]

@@ -34,8 +34,8 @@ class Linkage(Frozen):
     starts at its characteristic point. Its vector A_k runs along the link. The slide
     B_k of the next prismatic joint is perpendicular to A_k (90 degrees
     counter-clockwise). The mass centre lies p_k along and q_k across the link. Every
-    field is an array, so linkages of different topologies share one compilation and can
-    be stacked into a batch; fixed pairs make chains of different lengths alike.
+    field is an array: linkages of different topologies share one compilation and can be
+    stacked into a batch. Fixed pairs give chains of different lengths the same shapes.
     `replace(mass=...)` returns a checked copy with other values.
 
     **Arguments:**
