@@ -29,7 +29,7 @@ def forward_dynamics(
     some cases where those are singular, such as a massless revolute tip.
 
     **Arguments:** `q` [m or rad], `qd` [m/s or rad/s], `tau` [N or N m]; `forces`:
-    elements, of which those with masses count; efforts count only if `tau` has them.
+    elements, of which only masses count. Include their efforts in `tau`.
 
     **Returns:** `qdd` [m/s^2 or rad/s^2].
 
@@ -48,13 +48,14 @@ def forward_dynamics(
 def inertia_ratios(
     linkage: Linkage, q: Float[Array, " joint"], forces: Forces = ()
 ) -> Float[Array, " joint"]:
-    """Computes how well the accelerations are determined, in (0, 1] per joint.
+    """Computes how well each joint's acceleration is determined, in (0, 1].
 
-    The ratio 1 / (M_kk (M^-1)_kk) of the joint mass matrix has no unit. It divides the
-    inertia [kg or kg m^2] of a joint while the others are free to move by its inertia
-    while they are locked. The accelerations lose about -log10 of the least ratio in
+    The ratio 1 / (M_kk (M^-1)_kk) of the joint mass matrix has no unit. It is the
+    inertia [kg or kg m^2] of a joint with the others free to move, over its inertia
+    with the others locked. The accelerations lose about -log10 of the least ratio in
     digits. Below 1e-11 in float64 or 1e-5 in float32, `simulate` stops and reports it.
-    It is zero where the matrix is not positive definite, and infinite at fixed pairs.
+    The ratio is zero where the matrix is not positive definite, and infinite at fixed
+    pairs.
 
     **Arguments:** `q` [m or rad]; `forces`: elements, of which those with masses count.
 
@@ -124,7 +125,7 @@ def bias_force(
 ) -> Float[Array, " joint"]:
     """Computes the bias: gravity, centrifugal and Coriolis forces on the joints.
 
-    In M qdd + bias = tau, the bias is the effort of zero acceleration. It is minus phi
+    In M qdd + bias = tau, the bias is the effort at zero acceleration. It is minus phi
     of (14), projected on the real joints.
 
     **Arguments:** `q` [m or rad], `qd` [m/s or rad/s]; `forces`: elements, of which
@@ -194,8 +195,8 @@ def energy(
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Computes the kinetic and potential energy of the linkage, (6) and (7).
 
-    **Arguments:** `q` [m or rad], `qd` [m/s or rad/s]; `forces`: force elements, of
-    which masses, springs, stops and constant tensions add energy.
+    **Arguments:** `q` [m or rad], `qd` [m/s or rad/s]; `forces`: force elements.
+    Masses, springs, stops and constant tensions add energy.
 
     **Returns:** two numbers [J]; the potential is zero at the ground pivot's height.
 

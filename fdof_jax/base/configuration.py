@@ -62,19 +62,19 @@ def configure(
 ) -> None:
     """Sets up JAX for an application; call it once, before anything is computed.
 
-    Whatever the arguments, `configure` makes XLA compile small loops as one kernel if
-    the installed version needs an option for it (JAX before 0.12). Single arms are then
-    simulated up to four times as fast, and gradients take a third of the time.
+    `configure` always makes XLA compile small loops as one kernel; JAX before 0.12
+    needs an option for this. Single arms are then simulated up to four times as fast,
+    and gradients take a third of the time.
 
     **Arguments:** None leaves a setting as it is.
 
-    - `x64`: whether numbers have double precision. Arms and elements that exist
-      already keep theirs; `simulate` warns of them.
+    - `x64`: whether numbers have double precision. Existing arms and elements keep
+      their precision; `simulate` warns of them.
     - `cache`: a folder that keeps compiled programs for later processes; True for a
       folder in the user's cache directory, False for no folder. Each kind of processor
       has its own subfolder. Programs are deleted only if
-      `jax_compilation_cache_max_size` is set. JAX keeps none that calls Python, as your
-      `jax.jit` of `simulate` does unless `throw=False`.
+      `jax_compilation_cache_max_size` is set. JAX keeps no program that calls Python,
+      such as your `jax.jit` of `simulate` unless it has `throw=False`.
 
     **Raises:** ValueError for malformed arguments and for a folder that cannot be
     written. Warns if the option comes too late, because JAX has started.

@@ -246,27 +246,26 @@ def inverse_kinematics(
 ) -> Float[Array, " joint"]:
     """Computes joint positions for a tip position and a direction of the last link.
 
-    The solution is in closed form for every topology of three joints that move, one of
-    which turns, and of two where no orientation is commanded. It is selected by the
-    existence factors; fixed pairs may be anywhere. The direction from the first joint
-    to the last link's start is in (-pi, pi]; the angles follow from it without
-    wrapping.
+    The closed form covers every topology of three moving joints, at least one of which
+    turns, and of two if no orientation is commanded. Existence factors select the case;
+    fixed pairs may be anywhere. The direction from the first joint to the last link's
+    start is in (-pi, pi]; the angles follow from it without wrapping.
 
     **Arguments:**
 
     - `tip`: the point (x, y) [m].
     - `orientation`: the absolute angle of the last link [rad], th4 in the paper; None
       for an arm of two joints.
-    - `branch`: 1 or -1, the choice between two assemblies: the sign of the turn from
-      A2 to A3 (RRR), of the slide measured from the foot of the perpendicular (RPR), or
-      of the side of the turning vector (PRR, RRP). Two joints are as with a third that
+    - `branch`: 1 or -1, the choice between two assemblies: the sign of the turn from A2
+      to A3 (RRR), of the slide measured from the foot of the perpendicular (RPR), or of
+      the side of the turning vector (PRR, RRP). Two joints count as with a third that
       turns at the tip. Ignored where there is only one assembly.
 
     **Returns:** `q` [m or rad], 0 at fixed pairs; NaN for traced arguments if the point
-    is out of reach. A point beyond the reach by rounding is on its edge. There the two
-    assemblies meet, and derivatives in the point do not exist: they are not finite.
-    Close to it, joints move as the root of the distance from the edge, so that a point
-    known to 1e-16 m may leave them known to 1e-8 rad.
+    is out of reach. A point beyond the reach by rounding counts as on its edge, where
+    the two assemblies meet and derivatives in the point are not finite. Near the edge,
+    joints move as the root of the distance from it: a point known to 1e-16 m may give
+    joints known to 1e-8 rad.
 
     **Raises:** ValueError for malformed arguments, for a linkage of another number of
     joints or of three slides, and for concrete arguments if the point is out of reach.
