@@ -17,10 +17,9 @@ from .points import Between, Load, Point, over
 class Armature(InertialElement):
     """Rotors geared to the joints: inertia that turns with a joint's relative rate.
 
-    This is the usual approximation, which MuJoCo has too: the rate of the link that
-    carries the rotor is left out. At gear ratios of 50 and more, accelerations differ
-    by about half a percent. For direct drives and low ratios take `Rotor`, the exact
-    one.
+    This is the usual approximation, also MuJoCo's: it leaves out the rate of the link
+    that carries the rotor. At gear ratios of 50 and more, accelerations differ by about
+    half a percent. For direct drives and low ratios use `Rotor`, which is exact.
 
     **Arguments:** `inertia`: the rotor's inertia times the square of the gear ratio,
     one per joint or one for all, not negative [kg m^2; kg for a prismatic joint].
@@ -48,15 +47,15 @@ class Armature(InertialElement):
 
 
 class Rotor(InertialElement):
-    """Rotors of the joints' motors, on the links before the joints: exact coupling.
+    """Rotors of motors, carried by the links before their joints: exact coupling.
 
     A rotor turns about an axis at right angles to the plane. Its absolute rate is that
     of the link before the joint plus gear * qd, and its kinetic energy is
     inertia * rate^2 / 2. Its mass belongs to the link that carries it. A fixed pair has
     no rotor.
 
-    Take it for direct drives and low gear ratios. At ratios of 50 and more, an
-    `Armature` of gear^2 * inertia is as good: what it leaves out is 1 / gear of it.
+    Use `Rotor` for direct drives and low gear ratios. At ratios of 50 and more, an
+    `Armature` of gear^2 * inertia is as good: it leaves out a share of 1 / gear.
 
     **Arguments:** one value per joint or one for all.
 

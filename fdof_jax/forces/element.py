@@ -30,19 +30,19 @@ class Element(Part):
     """A force element, which acts on an arm: a pytree that computes joint efforts.
 
     `replace(name=...)` returns a checked copy with other values of the constructor's
-    arguments. It takes the fields; a class with other arguments has a method
+    arguments. These are the fields; a class with other arguments has a method
     `arguments`, which returns a dictionary of them.
 
     A subclass implements `__call__`, with joint positions, velocities and efforts of
     shape (n,) [m or rad; m/s or rad/s; N or N m]. All else has a default:
 
-    - `conditions`: conditions on values, beside the bounds that `field` declares;
+    - `conditions`: conditions on values, besides the bounds that `field` declares;
       `conditions_on(linkage)`: those on the arm's joints.
     - `jump_ts`: a time at which the efforts jump, or a list of such times; steps end
-      there [s]. By default they are those of its fields: of a reference, or of a
-      function of time.
-    - `check(linkage, ts)`: raises ValueError if the element does not fit the arm;
-      `simulate` calls it for words after a motion that failed.
+      there [s]. By default, the jumps of its fields: of a reference, or of a function
+      of time.
+    - `check(linkage, ts)`: raises ValueError if the element does not fit the arm; after
+      a failed motion, `simulate` calls it for its message.
     - `potential_energy(q, linkage)`: energy that it stores, () [J]; by default None.
 
     An element with a state is a `StatefulElement`, one that moves masses is an
@@ -66,7 +66,7 @@ class Element(Part):
     potential_energy = default(lambda self: None)
 
     def schedule(self, t: Array, linkage: Linkage) -> PyTree:
-        """Computes what depends on time alone; a step does so before its stages."""
+        """Computes what depends on time alone; a step calls it before its stages."""
         return ()
 
     def initial_state(self, linkage: Linkage) -> PyTree:
@@ -82,7 +82,7 @@ class Element(Part):
     def loads_on_points(
         self, t: Array, q: Array, qd: Array, qdd: Array, linkage: Linkage
     ) -> tuple[PyTree, ...] | None:
-        """Returns the `Load`s that bearings carry; None: `joint_reactions` raises."""
+        """Returns the `Load`s that bearings carry, or None if they are unknown."""
         return ()
 
 
@@ -123,12 +123,12 @@ def elements(name: str, forces: Forces) -> tuple[Element, ...]:
 
 
 def elements_on(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
-    """Returns forces as elements, with an entry per joint where one is for all joints.
+    """Returns forces as elements, with one number for all joints repeated for each.
 
     Programs then do not depend on how the numbers were given.
 
-    **Raises:** ValueError for what is no tuple of callables, and for values of other
-    chains.
+    **Raises:** ValueError unless `forces` is a tuple of callables whose values suit the
+    number of joints.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig7().linkage
@@ -218,15 +218,15 @@ class InertialElement(Element):
     inertia. A subclass implements `coordinates` and `weights`, and `at` if its masses
     depend on time.
 
-    Mass leaves, or comes, with the velocity of the body, as from a leaking bucket: the
+    Mass leaves or arrives with the velocity of the body, as from a leaking bucket: the
     equation of motion is M(t) qdd + bias = tau, without a term dM/dt. Only a `Payload`
-    comes with a velocity of its own.
+    arrives with a velocity of its own.
     """
 
     def at(self, t: Array | np.ndarray) -> "InertialElement":
-        """Returns the element at a time; itself, if its masses never change.
+        """Returns the element with its masses at a time, constant from then on.
 
-        Else an element whose masses never change, with those of this time.
+        Returns the element itself if its masses never change.
         """
         return self
 

@@ -70,11 +70,11 @@ def toward(friction: Array, direction: ArrayLike | Scalars) -> Array:
 
 
 class JointFriction(Holder):
-    """Coulomb friction of the joints: one that sticks, or one that is rounded off.
+    """Coulomb friction of the joints, which sticks, or is rounded off with `speed`.
 
-    While a joint slides, the effort is -level * sign(qd). Where its rate comes to zero
-    and no more than the static friction would hold it, it stands still, exactly, until
-    its load exceeds the static friction.
+    While a joint slides, the effort is -level * sign(qd). When its rate reaches zero
+    and the static friction can hold it, the joint stands exactly still until its load
+    exceeds the static friction.
 
     With `speed`, the effort is -level * tanh(qd / speed) instead: joints never stick,
     and creep at a fraction of `speed` under loads below the level. The smaller `speed`,
@@ -83,16 +83,17 @@ class JointFriction(Holder):
     **Arguments:** one per joint or one for all.
 
     - `level`: of sliding friction, not negative [N or N m].
-    - `static`: friction up to which a joint at rest is held, at least the level; by
-      default equal to it [N or N m].
+    - `static`: greatest friction that holds a joint at rest, at least the level; by
+      default the level [N or N m].
     - `speed`: positive [m/s or rad/s].
 
-    `level` and `static` may also have two rows, (2, n): against motions to positive
-    positions and to negative ones. Or they are functions `(t, q, qd, linkage)` that
-    return such numbers, positive and smooth in each direction, for instance `stribeck`;
-    times at which one jumps are its attribute `jump_ts`. Joints at rest are held by the
-    value at qd = 0. Negative values, and static friction below the level, end a motion
-    as not finite. `Solution.taken` does not count a level that is a function.
+    `level` and `static` may also have two rows, (2, n), against motions in the positive
+    and in the negative direction. Each may be a function `(t, q, qd, linkage)` that
+    returns such numbers, positive and smooth in each direction, for instance
+    `stribeck`. Its attribute `jump_ts` lists times at which it jumps. Joints at rest
+    are held by the value at qd = 0. Negative values, and static friction below the
+    level, end a motion as not finite. `Solution.taken` does not count a level that is a
+    function.
 
     **Raises:** ValueError for malformed arguments, and for `static` beside `speed`.
 
@@ -178,12 +179,12 @@ class JointFriction(Holder):
 class stribeck(Part):  # named as the function that it is
     """Friction that falls from static to sliding friction as a joint moves faster.
 
-    A `level` of `JointFriction`: coulomb + (static - coulomb) exp(-(qd / speed)^2).
+    A `level` for `JointFriction`: coulomb + (static - coulomb) exp(-(qd / speed)^2).
 
     **Arguments:** one per joint or one for all.
 
-    - `coulomb`, `static`: friction of fast slides and at rest, not negative [N or N m].
-    - `speed`: at which most of the difference is gone, positive [m/s or rad/s].
+    - `coulomb`, `static`: friction at high speed and at rest, not negative [N or N m].
+    - `speed`: speed at which most of the difference is gone, positive [m/s or rad/s].
 
     **Raises:** ValueError for malformed arguments.
 
@@ -209,16 +210,16 @@ class HardStops(Holder):
     """Rigid stops at the ends of the joints' ranges: impacts, bouncing and resting.
 
     A joint that reaches its stop at a rate v leaves it at -restitution * v; the blow
-    also changes the rates of the other joints. Blows knock frictions loose, and brakes
-    hold. A joint that bounces lower than can be told from the stop rests there, until
-    something pulls it away: the time and the height that are left out are about 1e-5 s
-    and 1e-11 m or rad (in float32, 1e-3 and 1e-5). `JointStops` are soft: take those
-    where the give of the stop matters, or where several contacts at a time share loads.
+    also changes the rates of the other joints. A blow breaks the hold of friction, but
+    not that of brakes. A joint whose bounces become too small to resolve rests on the
+    stop until something pulls it away: the bounces left out last about 1e-5 s and are
+    1e-11 m or rad high (in float32, 1e-3 and 1e-5). Use the soft `JointStops` where the
+    give of the stop matters, or where several contacts at once share loads.
 
     **Arguments:** all in joint order, one per joint or one for all.
 
     - `lower`, `upper`: ends of the range [m or rad]; may be infinite.
-    - `restitution`: from 0 to 1, elastic; by default blows take all of the rate.
+    - `restitution`: from 0, the default (blows take all of the rate), to 1 (elastic).
 
     **Raises:** ValueError for malformed arguments, and unless lower < upper.
 
@@ -243,16 +244,16 @@ class HardStops(Holder):
 class Brake(Holder):
     """A brake that holds joints between two known times, whatever that takes.
 
-    Where it takes hold, a blow stops its joints and changes the rates of the others.
-    One that acts at the start of a motion, or before, takes hold there: the first
-    rates of the motion are those after its blow.
+    When the brake engages, a blow stops its joints and changes the rates of the others.
+    If it holds at the start of a motion, it engages there: the first rates of the
+    motion are those after its blow.
 
     **Arguments:**
 
     - `joints`: the number of a joint, from 1, or several such numbers; fixed pairs are
       held in any case.
-    - `begin`, `end`: times at which it takes hold and lets go [s]; by default it always
-      has, and never does.
+    - `begin`, `end`: times at which the brake engages and lets go [s]; by default it
+      always holds.
 
     **Raises:** ValueError for malformed arguments, and unless begin < end.
 
@@ -289,7 +290,7 @@ class Brake(Holder):
 
     @property
     def jump_ts(self) -> Array:
-        """The times at which it takes hold and lets go [s]."""
+        """The times at which the brake engages and lets go [s]."""
         return jnp.stack([self.begin, self.end])
 
     def braking(self, t, linkage):

@@ -130,12 +130,12 @@ class JointStops(ScalarElement):
 
     At a penetration p the force is stiffness * p * (1 + damping * rate), and never less
     than 0; the rate is that of the joint, outwards. Steps end where the contact begins
-    and ends. `HardStops` are rigid, and cost no short steps: take these soft ones where
-    the give of a stop matters.
+    and ends. Rigid `HardStops` cost no short steps: use soft stops where the give of a
+    stop matters.
 
-    With `smoothing`, p is rounded off to a parabola within so much of the end of the
-    range, on both sides; at the end itself p is a quarter of `smoothing`. The damping
-    acts by the joint's own rate, so that a blow loses as much as without `smoothing`.
+    With `smoothing`, p is a parabola within that distance of the end of the range, on
+    both sides; at the end itself p is a quarter of `smoothing`. The damping acts by the
+    joint's own rate, so that a blow loses as much as without `smoothing`.
 
     **Arguments:** all in joint order, one per joint or one for all.
 

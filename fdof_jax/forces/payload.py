@@ -14,20 +14,20 @@ from .points import Load, Point
 class Payload(InertialElement):
     """A body that is fixed to a link between two known times.
 
-    Where it is taken, a blow changes the rates of all joints: the momenta of arm and
-    body before are those of both together after. Where it is let go, rates do not jump.
-    Functions without a time, such as `mass_matrix` and `energy`, do not know whether it
-    is taken: give them `at(t)`, the payload at a time.
+    When the body is taken, a blow changes the rates of all joints: the momenta of arm
+    and body before are those of both together after. When it is let go, rates do not
+    jump. Functions without a time, such as `mass_matrix` and `energy`, need `at(t)`,
+    the payload at a time.
 
     **Arguments:**
 
     - `place`: the `Point` of the link at which its mass centre is fixed.
     - `mass`, `inertia`: not negative [kg, kg m^2].
-    - `begin`, `end`: times at which it is taken and let go [s]; by default it is there
-      from the start on, and stays. One that is taken at the start of a motion, or
-      before, is part of the arm from the start.
-    - `velocity`: that of the body before it is taken, (x, y) [m/s], or with its angular
-      rate (x, y, rate) [rad/s]; by default it is at rest.
+    - `begin`, `end`: times at which it is taken and let go [s]; by default the arm
+      always has it. A payload taken at the start of a motion, or before, is part of the
+      arm from the start.
+    - `velocity`: velocity of the body before it is taken, (x, y) [m/s], or with its
+      angular rate (x, y, rate) [rad/s]; by default the body is at rest.
 
     **Raises:** ValueError for malformed arguments, and unless begin < end.
 

@@ -184,7 +184,7 @@ class Between(Element):
 
 
 def over(length: Array) -> Array:
-    """Reciprocal of a length; 1 where points meet and have no line."""
+    """Returns the reciprocal of a length; 1 where points meet and have no line."""
     return 1 / jnp.where(length > 0, length, 1)
 
 

@@ -84,14 +84,14 @@ def switch(
     `g` may have any unit [for instance m, rad or N] in which it is not tiny: less than
     1e-13 counts as 0. Adaptive steps end where `g` changes its sign, and derivatives
     include the effect of that time. Within a step both branches are continued beyond
-    the zero of `g`, and must be smooth and finite there. For what happens at known
-    times, as in references, declare `jump_ts` instead.
+    the zero of `g`, and must be smooth and finite there. For jumps at known times, as
+    in references, declare `jump_ts` instead.
 
-    `continuous`: whether the effort is the same on both sides where `g` is 0, in every
-    use of the result; programs for derivatives then compile faster.
+    `continuous`: whether every effort that uses the result is the same on both sides
+    where `g` is 0; programs for derivatives then compile faster.
 
-    **Raises:** ValueError within a function that the element itself has transformed by
-    JAX, as by `jax.jit`, `jax.vmap` or `jax.grad`.
+    **Raises:** ValueError within a function that the element itself transforms by
+    `jax.jit`, `jax.vmap`, `jax.grad` or the like.
 
     >>> import fdof_jax as fj
     >>> class Drag(fj.Element):  # air on one side, water on the other
