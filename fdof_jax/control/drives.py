@@ -68,7 +68,7 @@ class PIDController(StatefulElement):
         yield Condition(paired, "ki", "0 where kp is", (self.ki, self.pd.kp))
 
     def initial_state(self, linkage):
-        """The integral's share of the effort at the start, zeros (n,) [N or N m]."""
+        """Returns the integral's share at the start: zeros (n,) [N or N m]."""
         return jnp.zeros(joints_of(linkage))
 
     def __call__(self, t, q, qd, linkage, state):
@@ -93,12 +93,12 @@ class Drive(StatefulElement):
     command: Callable = called("a force element, a PDController for instance")
 
     def initial(self, linkage: Linkage) -> PyTree:
-        """The drive's own state at the start."""
+        """Returns the drive's own state at the start."""
         return ()
 
     @abstractmethod
     def respond(self, command: Array, qd: Array, own: PyTree) -> tuple[Array, PyTree]:
-        """The efforts (n,) and the rate of the drive's own state."""
+        """Returns the efforts (n,) and the rate of the drive's own state."""
 
     def initial_state(self, linkage):
         inner = element_of(self.command).initial_state(linkage)
@@ -162,10 +162,10 @@ class SpeedLimit(Drive):
     In the direction of motion the effort is at most stall * (1 - |qd| / no_load), not
     below 0. Against the motion it is at most stall, at any speed.
 
-    This is the curve in data sheets of servo drives, whose amplifiers limit the current
-    to that of stall. A motor on a limited voltage alone brakes with more than stall, as
-    its back-EMF adds to the voltage, and is braked above the no-load speed: take a
-    `DCMotor` where that matters.
+    Data sheets of servo drives show this curve: their amplifiers limit the current to
+    that of stall. A motor with a voltage limit alone brakes with more than stall,
+    because its back-EMF adds to the voltage, and is braked above the no-load speed. Use
+    a `DCMotor` where that matters.
 
     **Arguments:** `command`: a force element; `stall` [N or N m] and `no_load` [m/s or
     rad/s]: one per joint or one for all, positive.
@@ -194,21 +194,22 @@ class DCMotor(Drive):
     """Brushed motors on geared joints: winding, back-EMF, limited voltage and current.
 
     The current i obeys inductance * di/dt = v - resistance * i - constant * gear * qd,
-    and the effort is constant * gear * i. The command returns the voltages v. They are
+    and the effort is constant * gear * i. The command returns the voltages v, which are
     clipped such that the current stays within its limit, then to +-voltage_limit. At
-    speeds whose back-EMF exceeds that limit, the back-EMF drives the current. The
-    inertia of the rotors is a separate `Rotor` or `Armature`.
+    speeds whose back-EMF exceeds the voltage limit, the back-EMF drives the current.
+    The inertia of the rotors is a separate `Rotor` or `Armature`.
 
     Without inductance the current is (v - constant * gear * qd) / resistance at once,
-    and the motor has no state. Take that where inductance / resistance, often about a
-    millisecond, is short beside the motion: explicit steps are otherwise as short.
+    and the motor has no state. Leave the inductance out where inductance / resistance,
+    often about a millisecond, is short beside the motion: explicit steps are otherwise
+    as short.
 
     **Arguments:** one value per joint or one for all, positive.
 
-    - `command`: a force element, read as voltages [V].
-    - `resistance`: of the winding [ohm].
-    - `inductance`: of the winding, in all joints or in none [H]. Zeros are stored as
-      None; while it is traced, it is taken for positive.
+    - `command`: a force element, whose efforts are the voltages [V].
+    - `resistance`: resistance of the winding [ohm].
+    - `inductance`: inductance of the winding, in all joints or in none [H]. Zeros are
+      stored as None; a traced inductance must be positive.
     - `constant`: torque and back-EMF constant [N m/A = V s/rad; N/A of a linear motor].
     - `gear`: angle of the motor per angle of the joint [1] or per metre of a slide
       [rad/m].
@@ -258,7 +259,7 @@ class DCMotor(Drive):
             yield Condition(positive, "inductance", expected, self.inductance)
 
     def initial(self, linkage):
-        """The currents at the start [A], which are no state without inductance."""
+        """Returns the currents at the start [A]; none without inductance."""
         return () if self.inductance is None else jnp.zeros(joints_of(linkage))
 
     def respond(self, command, qd, own):

@@ -57,7 +57,7 @@ class PDController(ScalarElement):
     gain_units: ClassVar = {"R": ("N m/rad", "N m s/rad"), "P": ("N/m", "N s/m")}
 
     def schedule(self, t: Array, linkage: Linkage) -> Scalars:
-        """The reference motion (q_ref, qd_ref), independent of the state."""
+        """Returns the reference motion (q_ref, qd_ref), independent of the state."""
         return reference_motion(self.reference, t, linkage)
 
     def respond(self, scheduled, q, qd, linkage):
@@ -72,7 +72,7 @@ class PDController(ScalarElement):
         qd: Scalars | Array,
         linkage: Linkage,
     ) -> Scalars:
-        """The efforts before clipping; a subclass adds to them."""
+        """Computes the efforts before clipping; a subclass adds to them."""
         rows = zip(each(self.kp, q), each(self.kd, q), *scheduled, q, qd)
         return tuple(
             kp * (position - q) + kd * (velocity - qd)
@@ -80,7 +80,7 @@ class PDController(ScalarElement):
         )
 
     def demand(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
-        """The efforts before clipping, (n,) [N or N m]."""
+        """Computes the efforts before clipping, (n,) [N or N m]."""
         return jnp.stack(self.unlimited(self.schedule(t, linkage), q, qd, linkage))
 
 
@@ -118,16 +118,16 @@ class ModelBased(PDController):
 class GravityFeedforward(ModelBased):
     """PD control plus the efforts that hold the arm's weight: a force element.
 
-    The effort of a `PDController` and the effort that holds the arm at rest at its
-    actual position (not at the reference) are added and clipped to +-limit as a whole.
-    Plain PD control sags under gravity, in Fig 7 by a quarter of a metre.
+    The effort is that of a `PDController` plus the effort that holds the arm at rest at
+    its actual position (not at the reference), clipped to +-limit as a whole. Plain PD
+    control sags under gravity, in Fig 7 by a quarter of a metre.
 
     **Arguments:**
 
     - `kp`, `kd`, `limit`, `reference`: as in `PDController` [N/m or N m/rad, N s/m or
       N m s/rad, N or N m].
-    - `model`: the controller's model of the arm; None: the arm itself. It does not
-      include masses of other force elements, for instance of a load.
+    - `model`: the controller's model of the arm; None: the arm itself. Masses of other
+      force elements, for instance of a load, are not included.
 
     **Raises:** ValueError for malformed arguments.
 
@@ -173,16 +173,16 @@ class ComputedTorque(ModelBased):
     clipped to +-limit as a whole. With an exact model and within the limits, the error
     of each joint obeys d2e/dt2 + kd de/dt + kp e = 0.
 
-    The acceleration qdd_ref is the time derivative of the reference's velocities. It
-    has no impulse where the velocities jump.
+    The acceleration qdd_ref is the time derivative of the reference's velocities,
+    without impulses where the velocities jump.
 
     **Arguments:** one value per joint or one for all.
 
     - `kp` [1/s^2], `kd` [1/s]: gains from errors to accelerations, not negative.
     - `limit`: largest effort [N or N m], may be infinite.
     - `reference`: as in `PDController`; differentiable in time.
-    - `model`: the controller's model of the arm; None: the arm itself. It does not
-      include masses of other force elements, for instance of a load, nor their efforts.
+    - `model`: the controller's model of the arm; None: the arm itself. Masses and
+      efforts of other force elements, for instance of a load, are not included.
 
     **Raises:** ValueError for malformed arguments.
 
