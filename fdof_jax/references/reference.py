@@ -19,12 +19,12 @@ EXPECTED = "a callable (t, linkage) -> (q, qd), for instance CircleTask()"
 class Reference(Part):
     """A motion of the joints to follow: called as `(t, linkage) -> (q, qd)`.
 
-    Positions and velocities have shape (n,) [m or rad; m/s or rad/s]. Wherever a
-    reference is expected, other callables are accepted, such as plain functions. A
-    subclass implements `__call__`, or `assembly`; all else has a default:
+    Positions and velocities have shape (n,) [m or rad; m/s or rad/s]. Plain functions
+    and other callables are accepted wherever a reference is expected. A subclass
+    implements `__call__`, or `assembly`; all else has a default:
 
-    - `assembly(t, linkage)`: positions, and a root that is 0 at the edge of the reach.
-      The velocities are the exact rates of the positions.
+    - `assembly(t, linkage)`: returns positions, and a root that is 0 at the edge of the
+      reach. The velocities are then the exact rates of the positions.
     - `jump_ts`: a time at which the motion jumps, or a list of such times; steps end
       there [s].
     - `check(linkage, ts)`: raises ValueError if the arm cannot follow.
@@ -52,13 +52,13 @@ class Reference(Part):
             )
 
     def assembly(self, t: Array, linkage: Linkage) -> tuple[Array, Array | float]:
-        """Positions (n,) [m or rad], and a root that is 0 at the edge of the reach."""
+        """Returns positions (n,) [m or rad], and a root: 0 at the edge of the reach."""
         raise NotImplementedError  # found at construction
 
     def __call__(
         self, t: ArrayLike, linkage: Linkage
     ) -> tuple[Float[Array, " joint"], Float[Array, " joint"]]:
-        """Joint positions [m or rad] and velocities [m/s or rad/s] at time `t` [s]."""
+        """Computes positions [m or rad] and velocities [m/s or rad/s] at time `t` [s]."""
         check_linkage(linkage)
         arguments = self, real_array("t", t, ()), linkage
         # Functions may hold traced values, which no program at once could have.
@@ -121,8 +121,8 @@ def reachable(
 ) -> Bool[Array, " time"]:
     """Returns whether a linkage can reach the reference at each time.
 
-    A `TipTask` that passes behind the pivot between the first and the last time, so
-    that joints would jump, is out of reach at all times.
+    A `TipTask` is out of reach at all times if it passes behind the pivot between the
+    first and the last time, because joints would jump there.
 
     **Arguments:** `linkage`; `reference`: for instance a `CircleTask` or `TipTask`;
     `ts`: times (time,) [s].

@@ -12,13 +12,13 @@ from .reference import Reference
 
 
 class Step(Reference):
-    """Positions to hold that change at once, at a known time.
+    """A step of the joints' positions at a known time.
 
-    The reference has no velocity: a derivative gain acts on the arm's own.
+    The reference velocity is 0: a derivative gain acts on the arm's velocity alone.
 
     **Arguments:** positions are one per joint, or one for all.
 
-    - `before`, `after`: the positions before the step, and from it on [m or rad].
+    - `before`, `after`: the positions before the step, and from the step on [m or rad].
     - `begin`: the time of the step [s].
 
     **Raises:** ValueError for malformed arguments.
@@ -47,12 +47,11 @@ class Step(Reference):
 
 
 class Pulse(Reference):
-    """Positions to hold, and others between two known times.
+    """A pulse of the joints' positions between two known times.
 
     **Arguments:** positions are one per joint, or one for all.
 
-    - `outside`, `inside`: the positions before and after the pulse, and in it
-      [m or rad].
+    - `outside`, `inside`: the positions outside of the pulse and during it [m or rad].
     - `begin`, `end`: its times, begin < end [s].
 
     **Raises:** ValueError for malformed arguments.

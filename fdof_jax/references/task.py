@@ -52,17 +52,17 @@ class JointMove(Reference):
     travel: Travel = of_kind(Travel)
 
     def assembly(self, t: Array, linkage: Linkage) -> tuple[Array, float]:
-        """Joint positions, and 1 as the root: a joint move has no edge of a reach."""
+        """Returns positions, and 1 as the root: a joint move has no edge of a reach."""
         return self.start + self.travel(t) * (self.end - self.start), 1.0
 
 
 class SetPoint(Reference):
-    """A constant demand: positions to hold, and velocities if there are any.
+    """A constant set point: positions to hold, and optionally velocities.
 
     **Arguments:** one per joint, or one for all.
 
-    - `q`: [m or rad].
-    - `qd`: by default 0 [m/s or rad/s]. Servos take it beside `q`.
+    - `q`: positions [m or rad].
+    - `qd`: velocities, by default 0 [m/s or rad/s], for servos that take both.
 
     **Raises:** ValueError for malformed arguments.
 
@@ -113,11 +113,11 @@ class TipReference(Reference):
     def __call__(
         self, t: ArrayLike, linkage: Linkage
     ) -> tuple[Float[Array, " joint"], Float[Array, " joint"]]:
-        """Joint positions [m or rad] and velocities [m/s or rad/s] at time `t` [s].
+        """Returns positions [m or rad] and velocities [m/s or rad/s] at time `t` [s].
 
-        Out of reach, or for an arm with another number of joints, raises ValueError for
-        known arguments and returns NaN for traced ones. At the edge of the reach the
-        velocities are not finite.
+        Known arguments raise ValueError, and traced ones return NaN, where the tip is
+        out of reach or the arm has another number of joints. At the edge of the reach
+        the velocities are not finite.
         """
         motion = super().__call__(t, linkage)
         if not (is_traced(motion) or np.isfinite(motion).all()):
@@ -151,10 +151,10 @@ def reach_margin(
 ) -> Float[Array, " time"]:
     """Computes how far the tip is within the edge of the reach [m].
 
-    The reach is that of tips at the task's orientation. The margin is negative by the
-    distance from it where the tip is out of reach; infinite where the reach has no
-    edge, with two slides, and -inf if those are parallel. A search for lengths takes it
-    as a constraint.
+    The reach is that of tips at the task's orientation. Out of reach, the margin is
+    minus the distance from the reach. With two slides the reach has no edge, and the
+    margin is infinite, or -inf if the slides are parallel. A search for lengths can use
+    the margin as a constraint.
 
     **Arguments:** `linkage`; `task`: a `CircleTask` or a `TipTask`; `ts`: times (time,)
     [s].
@@ -179,8 +179,8 @@ class TipTask(TipReference):
 
     A call with `(t, linkage)` returns the joint reference, computed by the closed-form
     inverse kinematics and its exact rate. The wrist (where the last link starts) must
-    not cross the half-line from the ground pivot away from the path's middle, where the
-    angle of a turning arm would jump; `simulate` checks this.
+    not cross the half-line from the ground pivot away from the path's middle: there the
+    angle of a turning arm would jump. `simulate` checks this.
 
     **Arguments:**
 
@@ -191,7 +191,8 @@ class TipTask(TipReference):
     - `branch`: assembly of the arm, 1 (default) or -1: see `inverse_kinematics`.
 
     **Raises:** ValueError for malformed arguments. `check`, and so `simulate`, raises
-    it for a path out of the linkage's reach, and a call where the tip is out of it.
+    ValueError for a path out of the linkage's reach; a call does where the tip is out
+    of reach.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig7().linkage
@@ -227,10 +228,10 @@ class TipTask(TipReference):
     def check(self, linkage: Linkage, ts: Array) -> None:
         """Raises ValueError if the tip leaves the reach or the wrist's angle jumps.
 
-        Both are checked at 1000 times or more between `ts[0]` and `ts[-1]`: those of
-        a `Travel`, at most one lap of `Laps`. For a timing of another kind, they are
-        1000 times of all of the run, and as many at which the share of the way changes
-        between these. The path of `Laps` has to be closed.
+        Both are checked at 1000 times or more between `ts[0]` and `ts[-1]`: during a
+        `Travel`, or during at most one lap of `Laps`. For another timing, 1000 times
+        span the run, and as many more lie where the share of the way changes between
+        these. The path of `Laps` has to be closed.
         """
         super().check(linkage, ts)
         check_moving_joints(linkage, self.orientation is not None)
@@ -306,9 +307,9 @@ class CircleTask(TipReference):
     """A circle traced by the tip at constant speed; the last link keeps its angle.
 
     A call with `(t, linkage)` returns the joint reference, computed by the closed-form
-    inverse kinematics and its exact rate. The reference is continuous in time, also
-    where the path winds around the base, which no `TipTask` may do. At t = 0 it equals
-    that of `inverse_kinematics`.
+    inverse kinematics and its exact rate. The reference is continuous in time, even if
+    the path winds around the base, which no `TipTask` may do. At t = 0 it equals the
+    result of `inverse_kinematics`.
 
     The circle of Fig 7 is not printed in the paper: the default is our choice. It lies
     inside the reach of the figure's arm and starts 0.25 m from the arm's tip, because
@@ -325,7 +326,8 @@ class CircleTask(TipReference):
     - `branch`: assembly of the arm, 1 or -1: see `inverse_kinematics`.
 
     **Raises:** ValueError for malformed arguments. `check`, and so `simulate`, raises
-    it for a circle out of the linkage's reach, and a call where the tip is out of it.
+    ValueError for a circle out of the linkage's reach; a call does where the tip is out
+    of reach.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig7().linkage

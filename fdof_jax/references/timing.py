@@ -37,7 +37,7 @@ class Travel(Part):
     **Arguments:**
 
     - `duration`: positive [s].
-    - `begin`: time at which the travel starts [s]; it rests before.
+    - `begin`: time at which the travel starts [s]; the reference rests before.
     - `profile`: "harmonic" (the way is a cosine), "cycloidal" (the acceleration is a
       sine), "quintic" (no acceleration at both ends; the default) or "trapezoidal" (the
       velocity is a trapezium, speeding up and slowing down in a quarter of the time
@@ -62,7 +62,7 @@ class Travel(Part):
         one_of("profile", self.profile, tuple(PROFILES))
 
     def __call__(self, t: Array) -> Array:
-        """The share of the way at time `t` [s], from 0 to 1."""
+        """Returns the share of the way at time `t` [s], from 0 to 1."""
         x = (t - self.begin) / self.duration
         # At a jump the derivative is that after it; jnp.clip's would be the mean.
         x = jnp.where(x < 0, 0, jnp.where(x < 1, x, 1))
