@@ -32,7 +32,7 @@ class Path(Part):
 
     @abstractmethod
     def point(self, share: Array) -> Array:
-        """Computes the point (x, y) [m] at a share of the way, from 0 to 1 or per lap."""
+        """Returns the point (x, y) at a share of the way, 0 to 1 or per lap [m]."""
 
 
 class Line(Path):

@@ -58,7 +58,7 @@ class Reference(Part):
     def __call__(
         self, t: ArrayLike, linkage: Linkage
     ) -> tuple[Float[Array, " joint"], Float[Array, " joint"]]:
-        """Computes positions [m or rad] and velocities [m/s or rad/s] at time `t` [s]."""
+        """Returns positions [m or rad] and velocities [per s] at time `t` [s]."""
         check_linkage(linkage)
         arguments = self, real_array("t", t, ()), linkage
         # Functions may hold traced values, which no program at once could have.
