@@ -66,7 +66,7 @@ def checked(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
 def equilibrium(
     linkage: Linkage, q: ArrayLike, forces: Forces = (), t: ArrayLike = 0.0
 ) -> Float[Array, " joint"]:
-    """Joint positions near `q` at which the arm stays at rest under its forces.
+    """Computes positions near `q` at which the arm stays at rest under its forces.
 
     An equilibrium is an operating point for `linearize`. Under a PD controller it is
     the position held while the reference stands still, including the sag.
@@ -74,12 +74,12 @@ def equilibrium(
     **Arguments:** `linkage`; `q`: first guess [m or rad]; `forces`: elements without a
     state of their own; `t`: time at which they are evaluated [s].
 
-    **Returns:** positions (n,); NaN if the Levenberg-Marquardt method finds none, for
-    instance from a guess at which actuators are at their limits. The equilibrium need
-    not be stable: see `linearize`.
+    **Returns:** joint positions (n,); NaN if the Levenberg-Marquardt method finds none,
+    for instance from a guess at which actuators are at their limits. The equilibrium
+    need not be stable: see `linearize`.
 
-    **Raises:** ValueError for malformed arguments, and elements that hold joints: a
-    joint that friction holds rests at many positions.
+    **Raises:** ValueError for malformed arguments, and for elements that hold joints: a
+    joint held by friction rests at many positions.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
@@ -136,10 +136,10 @@ def _lacking(
 def holding_efforts(
     linkage: Linkage, q: ArrayLike, forces: Forces = (), t: ArrayLike = 0.0
 ) -> Float[Array, " joint"]:
-    """The joint efforts that, together with the forces, hold the arm at rest.
+    """Computes the joint efforts that hold the arm at rest, together with the forces.
 
-    Without forces they balance gravity. Springs and stops carry their part, and masses
-    of elements are held too.
+    Without forces the efforts balance gravity. Springs and stops carry their part, and
+    masses of elements are held too.
 
     **Arguments:** `linkage`; `q`: joint positions [m or rad]; `forces`: elements
     without a state of their own; `t`: time at which they are evaluated [s].
@@ -173,8 +173,8 @@ def linearize(
     the state is then the scene's start.
 
     **Returns:** `A` and `B` of d(q, qd)/dt = A (q, qd) + B tau, for small changes. The
-    efforts tau act in the joints in addition to the forces [N or N m]. For a force with
-    kinks, the slope at the state counts: a controller at its limit has no gains.
+    efforts tau act in the joints in addition to the forces [N or N m]. A force with
+    kinks has its slope at the state: a controller at its limit has no gains.
 
     **Raises:** ValueError for malformed arguments.
 
@@ -321,8 +321,8 @@ def closed_loop_modes(linkage: Linkage, forces: Forces, solution: Solution) -> M
     as the modes, stable eigenvalues do not prove stability. While a controller is at
     its limit, the gains of that joint do not act.
 
-    NumPy computes the eigenvalues on the CPU, as XLA has those of general matrices only
-    there. The function cannot be used within JAX's transformations.
+    NumPy computes the eigenvalues on the CPU, because XLA supports general matrices
+    only there. The function cannot be used within JAX's transformations.
 
     **Arguments:** `linkage`; `forces`: elements without a state of their own;
     `solution`: a motion under these forces.

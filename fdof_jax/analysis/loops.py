@@ -33,9 +33,9 @@ def open_loop(
 ) -> "control.StateSpace":
     """Breaks the loop of a controller at one joint's effort, about a configuration.
 
-    The controller's efforts in the other joints stay. The arm is at rest at `q`, where
-    constant efforts hold it. For a controller with kinks, the slope there counts: at
-    its limit it has no gains, so place `q` near its reference.
+    The controller keeps acting in the other joints. Constant efforts hold the arm at
+    rest at `q`. A controller with kinks has its slope there: at its limit it has no
+    gains, so place `q` near its reference.
 
     **Arguments:**
 
@@ -48,8 +48,8 @@ def open_loop(
 
     **Returns:** the loop L(s) as a `control.StateSpace` with one input and one output,
     for instance for `margins`, `control.bode_plot` or `control.nyquist_plot`. The state
-    holds positions [m or rad], velocities and the controller's own state. Where the
-    loop is closed again, the system is `loop.feedback()`.
+    holds positions [m or rad], velocities and the controller's own state.
+    `loop.feedback()` is the system with the loop closed again.
 
     **Raises:** ValueError for malformed arguments and within JAX's transformations.
 
@@ -73,15 +73,15 @@ def closed_loop(
 ) -> "control.StateSpace":
     """Linearises how a joint follows its reference, about a configuration.
 
-    The reference changes in this joint, with its velocities and accelerations; the
-    controller holds the other joints. The response is L / (1 + L) only where the
-    controller acts on nothing but the error and its rate.
+    Only this joint's reference changes, with its velocities and accelerations; the
+    controller holds the other joints. The response is L / (1 + L) only if the
+    controller acts on the error and its rate alone.
 
     **Arguments:** as in `open_loop`.
 
     **Returns:** the response T(s) of the joint's position to its reference as a
     `control.StateSpace`, for instance for `bandwidth` or `control.step_response`. T is
-    0 for a controller without a reference that is known, such as a plain function.
+    0 for a controller without a known reference, such as a plain function.
 
     **Raises:** ValueError as `open_loop`.
 
@@ -143,11 +143,11 @@ def loops_of(
 class Margins(NamedTuple):
     """Distances of a loop from instability.
 
-    - `gain`: factor on the loop, the nearest to 1, that makes it unstable. Below 1 it
-      belongs to an arm that falls if the gains are too low.
+    - `gain`: the factor nearest to 1 that makes the loop unstable. A factor below 1
+      means that the arm falls if the gains are too low.
     - `phase`, `delay`: least change of the phase [rad], and least delay [s], that make
       it unstable.
-    - `modulus`: least distance |1 + L| at all frequencies. With m this distance, the
+    - `modulus`: least distance |1 + L| over all frequencies. If this distance is m, the
       loop stays stable for factors from 1 / (1 + m) to 1 / (1 - m), and the phase
       margin is at least 2 arcsin(m / 2).
     - `crossover`: frequency of the phase margin, at which |L| = 1 [rad/s].
@@ -166,7 +166,7 @@ def margins(loop: "control.StateSpace") -> Margins:
     **Arguments:** `loop`: the result of `open_loop`.
 
     **Returns:** `Margins` [1, rad, s, 1, rad/s], NaN if the closed loop is not stable.
-    Where no change makes it unstable, they are infinite, that of the modulus is 1.
+    Where no change makes it unstable, margins are infinite and the modulus is 1.
 
     **Raises:** ValueError if `loop` is not a `control.StateSpace`.
 
@@ -199,7 +199,7 @@ def margins(loop: "control.StateSpace") -> Margins:
 
 
 def bandwidth(response: "control.StateSpace") -> float:
-    """Frequency above which a joint follows its reference by 3 dB less than at rest.
+    """Computes the frequency above which a joint follows 3 dB less than at rest.
 
     **Arguments:** `response`: the result of `closed_loop`.
 

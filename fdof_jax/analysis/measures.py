@@ -38,20 +38,21 @@ _STANDS = 1e-9  # changes of a reference that are less are none [m or rad]
 class Response(Report):
     """Measures of how joints followed the reference of their controller; prints itself.
 
-    Measures of a step are those of the field: about the position at the last time, from
-    which a load or friction may keep the reference away (`steady_error`). They are NaN
-    for joints whose reference moves meanwhile, as with a `Pulse` or a `Ramp`, or has
-    been reached from the start.
+    Measures of a step refer, as is usual, to the position at the last time, which a
+    load or friction may keep away from the reference (`steady_error`). They are NaN for
+    joints whose reference moves meanwhile, as with a `Pulse` or a `Ramp`, or has been
+    reached from the start.
 
     - `joints`: names of the moving joints, for instance R1.
     - `step`: from where the joint was to the final reference (joint,) [m or rad].
     - `overshoot`: greatest excess over the last position, as a share of the change up
       to it (joint,).
-    - `rise_time`: from 10 to 90 % of that change (joint,) [s].
-    - `settling_time`: after which the joint stays within 2 % of that change of its last
-      position (joint,) [s]; NaN if that is in the last tenth of the time or never.
-    - `steady_error`: of the last position from the reference (joint,) [m or rad].
-    - `largest_error`, `rms_error`: from the reference, over all samples (joint,)
+    - `rise_time`: time from 10 to 90 % of that change (joint,) [s].
+    - `settling_time`: time after which the joint stays within 2 % of that change around
+      its last position (joint,) [s]; NaN if that is in the last tenth of the time or
+      never.
+    - `steady_error`: error of the last position from the reference (joint,) [m or rad].
+    - `largest_error`, `rms_error`: errors from the reference over all samples (joint,)
       [m or rad].
     - `saturated`: share of the samples at which the actuator is at its limit (joint,).
     """
@@ -102,18 +103,18 @@ def response(
 ) -> Response:
     """Measures how a motion followed the reference of its controller.
 
-    Between the samples of the motion its cubics are taken, so that times are found more
-    closely than samples lie apart.
+    Cubics between the samples of the motion resolve times more closely than the
+    samples.
 
     **Arguments:**
 
     - `linkage`, `solution`: the arm and one motion of it, with ten samples or more in
       the fastest swing.
-    - `forces`: those of the solution, of `simulate_sampled` `(control, *forces)`. One
+    - `forces`: those of the solution; for `simulate_sampled`, `(control, *forces)`. One
       of them is, or is a drive that holds, a `PDController`, `PIDController`,
       `GravityFeedforward` or `ComputedTorque`.
-    - `since`: the time from which on the motion counts, as that of a step [s]; by
-      default all of it does.
+    - `since`: the time from which the motion counts, such as that of a step [s]; by
+      default all of it counts.
 
     **Raises:** ValueError for malformed arguments, for a motion that failed, and under
     JAX's transformations.

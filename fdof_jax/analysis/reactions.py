@@ -43,21 +43,21 @@ def _loads(
 def joint_reactions(
     linkage: Linkage, forces: Forces, solution: Solution
 ) -> Float[Array, "time joint 3"]:
-    """Force and moment of each joint's bearing on the next link, along a motion.
+    """Computes force and moment of each joint's bearing on the next link over time.
 
     They follow from the balances of Newton and Euler, link by link from the tip. In a
     joint's free direction, the reaction is the effort of dampers, controllers, drives,
-    armatures and what holds the joint. Loads on points act on the links themselves.
+    armatures and whatever holds the joint. Loads on points act on the links themselves.
 
-    **Arguments:** `linkage`, `forces` and `solution` of one `simulate`; of
+    **Arguments:** `linkage`, `forces` and `solution` of one `simulate`. For
     `simulate_sampled`, the forces are `(control, *forces)`. A `Scene` may stand for
     linkage and forces: `joint_reactions(scene, solution)`.
 
     **Returns:** force (x, y) [N] and moment [N m] on the moving link, at its
     characteristic point (see `joint_positions`). The previous link gets the opposite.
 
-    **Raises:** ValueError if `forces` is not a tuple of force elements, and for an
-    element that moves masses but has no method `loads`.
+    **Raises:** ValueError if `forces` is not a tuple of force elements, or an element
+    moves masses but has no method `loads`.
 
     >>> import fdof_jax as fj
     >>> import numpy as np
@@ -99,7 +99,7 @@ def _reactions(
 
 
 def inertial_parameters(linkage: Linkage) -> Float[Array, "link 4"]:
-    """Mass [kg], moments m p, m q [kg m] and inertia [kg m^2] of each link.
+    """Computes mass [kg], moments m p, m q [kg m] and inertia [kg m^2] of each link.
 
     The inertia is about the characteristic point of the link. The dynamics are linear
     in these parameters: see `regressor`.
@@ -124,7 +124,7 @@ def regressor(
     qd: Float[Array, " joint"],
     qdd: Float[Array, " joint"],
 ) -> Float[Array, "joint link 4"]:
-    """Coefficients of the inertial parameters in the inverse dynamics.
+    """Computes the coefficients of the inertial parameters in the inverse dynamics.
 
     The efforts are tau = regressor : `inertial_parameters(linkage)`, summed over links
     and parameters. The regressor itself does not depend on the linkage's masses and
