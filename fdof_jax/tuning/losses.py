@@ -81,7 +81,7 @@ def _check_motion(scene: Scene, solution: Solution) -> None:
 
 
 def tip_errors(scene: Scene, solution: Solution) -> Float[Array, " residual"]:
-    """Tip errors at the output times, scaled so that their squares sum to the mean.
+    """Computes tip errors over time, scaled so that their squares sum to the mean.
 
     **Arguments:** `scene`, whose PD controller must track a task with a `tip`;
     `solution`: its motion.
@@ -113,11 +113,11 @@ def tip_deviation(
 
 
 def joint_errors(scene: Scene, solution: Solution) -> Float[Array, " residual"]:
-    """Joint errors at the output times, scaled so that their squares sum to the mean.
+    """Computes joint errors over time, scaled so that their squares sum to the mean.
 
     This is a loss for controllers whose reference has no `tip`. It adds errors of
-    slides [m] and angles [rad] as they are. A joint without gains, kp and kd 0, is not
-    driven, and does not count.
+    slides [m] and angles [rad] as they are. A joint with kp and kd 0 is not driven and
+    does not count.
 
     **Arguments:** `scene`, with exactly one `PDController`; `solution`: its motion.
 

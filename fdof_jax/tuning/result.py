@@ -31,7 +31,7 @@ class History(eqx.Module):
     - `saturated`: share of the time that each actuator spends at its limit.
     - `effort`: root mean square of each effort over its limit.
     - `tip_error`: rms tip error [m]; NaN for a reference without a `tip`.
-    - `wall_time`: since the start of the search, compilation included [s].
+    - `wall_time`: time since the start of the search, compilation included [s].
 
     For an ensemble, `saturated` and `effort` are means over the members, and
     `tip_error` is the root of the mean square.
@@ -53,10 +53,10 @@ class TuneResult(Report):
     - `loss`: loss with the tuned gains [m^2 with the default loss].
     - `histories`: `History` of each run, the first from the scene's own gains.
     - `lower`, `upper`: the bounds of kp and kd (2, n).
-    - `converged`: whether the run stopped by itself, no actuator was at its limit most
-      of the time, and a change of the gains by 1 % would change the loss by less
-      than a ten-thousandth, to first order and within the bounds.
-    - `message`: why the run stopped, in words, and what to beware of.
+    - `converged`: whether three things hold: the run stopped by itself; no actuator was
+      at its limit most of the time; a change of the gains by 1 %, within the bounds,
+      would change the loss by less than a ten-thousandth, to first order.
+    - `message`: why the run stopped, and warnings, in words.
     - `member_loss`, `member_tip_error`: loss (member,) and rms tip error (member,) [m]
       of each member of the ensemble with the tuned gains.
     - `settings`: method, solver, tolerance and dtype of the run.

@@ -82,21 +82,21 @@ def tune(
     """Minimises a scene's loss in the gains of its PD controller, within bounds.
 
     The unknowns are the logarithms of kp and kd; gains of zero stay zero. Derivatives
-    are tangents of the motion, whose steps have a tolerance of 1e-6. Their relative
-    error is about 1e-6, and some 1e-4 where actuators are at their limits for long. A
-    second call with other numbers, another topology or another method compiles nothing;
-    a call with a loss function of other code does.
+    are tangents of the motion, whose steps have a tolerance of 1e-6. The relative error
+    of derivatives is about 1e-6, or some 1e-4 if actuators are at their limits for
+    long. A second call with other numbers, another topology or another method compiles
+    nothing; a call with a loss function of other code does.
 
     **Arguments:**
 
-    - `scene`: must hold exactly one `PDController`.
+    - `scene`: a scene with exactly one `PDController`.
     - `factor`: the gains stay within this factor of their start, above 1; by default 4.
     - `bounds`: instead of a factor, the least and the greatest kp and kd: two arrays
       (2, n), first row kp, second kd [N/m or N m/rad, N s/m or N m s/rad].
-    - `loss`: `(scene, solution) -> residuals`. The sum of squares of an array is
-      minimised; a scalar, never negative, is minimised itself, which gives
-      Levenberg-Marquardt little to go by. By default `tip_errors`: the mean squared tip
-      error at 1001 equally spaced times in [0, t1]. `Tracking` puts a price on effort.
+    - `loss`: `(scene, solution) -> residuals`, an array whose sum of squares is
+      minimised. By default `tip_errors`: the mean squared tip error at 1001 equally
+      spaced times in [0, t1]. `Tracking` puts a price on effort. A scalar, never
+      negative, is minimised itself, but gives Levenberg-Marquardt little to go by.
     - `ensemble`: scenes like `scene`, stacked along a leading axis (`stacked`). The
       loss is then that of the ensemble with common gains, which start from those of
       `scene`.
@@ -104,12 +104,12 @@ def tune(
       mean of order 32.
     - `method`: "levenberg-marquardt", or "l-bfgs" by optax.
     - `starts`: number of runs: one from the scene's gains, the others from random gains
-      within the bounds. The best counts.
+      within the bounds. The best run counts.
     - `seed`: seed of the random starts.
     - `max_steps`: greatest number of evaluations of a run after the first.
     - `report`: called with a line of progress after each step, for instance `print`.
 
-    `tune` cannot be used within JAX's transformations, as NumPy decides its steps.
+    `tune` cannot be used within JAX's transformations: NumPy decides its steps.
 
     **Returns:** a `TuneResult`, whose `message` says why the search stopped.
 

@@ -65,8 +65,8 @@ class Limits(Part):
     """Limits on the response to a step, for `tune_within`.
 
     The step of a joint leads from the start of the motion to where the arm rests at the
-    last set point. A joint whose limit is infinite (for the margin: 0) has none. Give
-    overshoot and settling time only for joints that step.
+    last set point. An infinite limit (for the margin: 0) limits nothing. Give overshoot
+    and settling time only for joints that step.
 
     **Arguments:** one value per joint or one for all.
 
@@ -365,25 +365,26 @@ def tune_within(
 ) -> TunedWithin:
     """Minimises a scene's loss in its gains, within limits on how it responds.
 
-    SciPy's sequential quadratic programming (SLSQP) searches, by the derivatives of the
-    loss and of the largest excess over each limit in short spans of time and bands of
-    frequency. It sees 1001 times and 200 frequencies; the report is measured as finely
-    as the fastest mode asks for, so that a limit that is exceeded between them counts
-    as not met.
+    The search is SciPy's sequential quadratic programming (SLSQP). It uses derivatives
+    of the loss, and of the largest excess over each limit in short spans of time and
+    bands of frequency. It sees 1001 times and 200 frequencies. The report is measured
+    as finely as the fastest mode requires: a limit exceeded between these samples
+    counts as not met.
 
     **Arguments:**
 
-    - `scene`: a step, for instance: must hold exactly one `PDController`, and otherwise
+    - `scene`: for instance a step, with exactly one `PDController`, and otherwise
       elements without a state of their own.
     - `limits`: a `Limits` [s, N or N m].
     - `loss`, `factor`, `bounds`: as in `tune`.
     - `max_steps`: greatest number of steps, which take one or a few evaluations each.
     - `report`: called with a line after each evaluation, for instance `print`.
 
-    **Returns:** a `TunedWithin`, which says which limits are met. If no gains are found
-    that meet all, it holds those whose greatest excess is least: positions at any time
-    count as shares of the step, efforts and margins as shares of their limits. The
-    excess is then spread over several limits; other gains may meet more of them.
+    **Returns:** a `TunedWithin`, which reports the limits that are met. If the search
+    finds no gains that meet all, it holds those whose greatest excess is least:
+    positions at any time count as shares of the step, efforts and margins as shares of
+    their limits. The excess is then spread over several limits; other gains may meet
+    more of them.
 
     **Raises:** ValueError as `tune`, and if the arm has no equilibrium at the last set
     point.
