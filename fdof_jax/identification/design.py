@@ -42,9 +42,10 @@ class NextMotion(Report):
     """The motion to record next; prints itself in a few lines.
 
     - `motion`: its numbers by name, for `experiment`.
-    - `standard_errors`: those expected by name [unit of each parameter], when this
-      motion is recorded and fitted together with the earlier recordings.
-    - `improvement`: the largest relative standard error before, over that expected [1].
+    - `standard_errors`: expected standard errors by name [unit of each parameter], if
+      this motion is recorded and fitted together with the earlier recordings.
+    - `improvement`: the largest relative standard error so far over the expected one
+      [1].
     - `message`: why the search stopped.
     """
 
@@ -134,16 +135,17 @@ def next_motion(
 
     A motion is a few named numbers, for instance efforts at knots, or amplitudes and
     phases. The search follows the gradient of the largest relative standard error,
-    through the inverse of the information matrix: that of the earlier recordings, by
-    the covariance of their fit, plus that of the new one at the parameters found. It
-    finds the best motion near `start`; other starts may lead to better ones.
+    which the inverse of the information matrix gives. This matrix is that of the
+    earlier recordings, from the covariance of their fit, plus that of the new one at
+    the parameters found. The search finds the best motion near `start`; other starts
+    may lead to better ones.
 
     **Arguments:**
 
     - `experiment`: called with the motion's numbers by name, returns the `scene_at` of
       `fit`, for instance a class of Equinox modules.
-    - `found`: the result for the earlier recordings. Combinations of parameters that
-      these do not determine are taken to be unknown one by one.
+    - `found`: the `FitResult` of the earlier recordings. Parameters in combinations
+      that these do not determine count as unknown one by one.
     - `start`: first guess of the motion's numbers, strictly within all limits.
     - `ts`: increasing times of the new recording (time,) [s].
     - `noise`: standard deviation of its readings [their unit], as in `fit`.

@@ -150,8 +150,8 @@ def fit(
     **Arguments:**
 
     - `scene_at`: returns the scene for a dict of named parameters (numbers or arrays);
-      the scene's `t1` is ignored. Several scenes: a list of Equinox modules that differ
-      only in numbers, fitted together, with a recording each.
+      the scene's `t1` is ignored. For several scenes, fitted together with a recording
+      each: a list of Equinox modules that differ only in numbers.
     - `start`: first guess of each parameter, in its own SI unit.
     - `ts`: increasing times (time,) [s]. The motion starts at `ts[0]`, in the scene's
       state. For a recording that begins later, keep the time of the start, with NaN
@@ -164,11 +164,11 @@ def fit(
     - `noise`: standard deviation of a reading [its unit], one number or an array that
       broadcasts to a recording. If None, all readings weigh the same, and the noise is
       estimated: for standard errors from all residuals; for the verdict from changes
-      between successive ones, because errors of a model change slowly. Readings that
-      cannot be wrong, as of a fixed pair, are left out.
-    - `validate`: (scene_at, observed) of recordings that the fit does not see, at the
-      same times, one or a list of them; the result compares their residuals with the
-      noise. Best are motions unlike those that are fitted.
+      between successive residuals, because errors of a model change slowly. Readings
+      that cannot be wrong, such as those of a fixed pair, are left out.
+    - `validate`: held-out recordings as (scene_at, observed), one pair or a list, at
+      the same times. The result compares their residuals with the noise. Choose motions
+      unlike the fitted ones.
     - `bounds`: (least, greatest) of parameters by name.
     - `scale`: sizes of parameters by name; a step changes a parameter by at most two
       sizes. By default the magnitudes of the start, which then must not be 0.

@@ -121,7 +121,7 @@ def unknowns_of(
 
 
 def link_ends(scene: Scene, solution: Solution) -> Float[Array, "time link 2"]:
-    """Positions of markers at the ends of the links: the next joints, and the tip.
+    """Computes positions of markers at the links' ends: the next joints, and the tip.
 
     **Arguments:** `scene`; `solution`: its motion.
 

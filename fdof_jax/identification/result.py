@@ -50,17 +50,17 @@ class FitResult(Report):
     - `converged`: whether a further step would change the parameters by less than 3 %
       of their standard errors, or a millionth of their sizes. True also if the motion
       does not determine some of them (see `weak`), which then stay where they are.
-    - `message`: why the search stopped, and what to beware of.
+    - `message`: why the search stopped, and warnings.
     - `history`: weighted sum of squares over all of the recording, at the start of the
       last search (the result over three quarters of it) and at each accepted point.
     - `held_out`: root mean square of the residuals of each recording given as
-      `validate`, relative to the noise [1]. Without a given noise this is not `noise`,
-      but the estimate by changes between successive residuals.
+      `validate`, relative to the noise [1]. Without a given noise, the noise here is
+      not `noise`, but the estimate from changes between successive residuals.
     - `faults`: reasons not to use the parameters, in words: a search that has not
-      converged, combinations that are `weak`, residuals well above the noise, and
-      held-out residuals above it. The noise is that of `held_out`. Held-out residuals
-      may exceed it by a tenth and three standard deviations; errors of the parameters
-      add to them, by a factor that is named.
+      converged, combinations that are `weak`, residuals well above the noise of
+      `held_out`, and held-out residuals above it. Held-out residuals may exceed this
+      noise by a tenth and three standard deviations. Errors of the parameters add to
+      them, by a factor that is named.
     """
 
     parameters: Named
@@ -78,7 +78,7 @@ class FitResult(Report):
 
     @property
     def usable(self) -> bool:
-        """True if no fault is known. Without held-out recordings that says little."""
+        """True if no fault is known, which says little without held-out recordings."""
         return not self.faults
 
     def _verdict(self) -> list[str]:
