@@ -44,8 +44,8 @@ _MEANT = ValueError, TypeError, LookupError, AttributeError, ArithmeticError
 def save(path: str | os.PathLike, tree: PyTree) -> None:
     """Writes scenes, elements, results or numbers to a file of JSON, for `load`.
 
-    An object stands by its public name and the arguments of its constructor, so that
-    the file can be read, compared, sent, and written by hand:
+    The file holds each object's public name and the arguments of its constructor. It
+    can be read, compared, sent, and written by hand:
 
         {"fdof_jax": "0.2",
          "State": {"q": [0.5, 0.0], "qd": [0.0, 0.0]}}
@@ -55,7 +55,7 @@ def save(path: str | os.PathLike, tree: PyTree) -> None:
       numbers. Any other list is a tuple.
     - `{"tuple": [...]}` is a tuple that begins with a number or an array, and
       `{"dict": {...}}` a dictionary.
-    - At the top, `"value"` names what is no object.
+    - At the top level, `"value"` names anything that is no object.
 
     An existing file is replaced when the new one is complete. It keeps its permissions,
     and a link to it stays.
@@ -102,8 +102,8 @@ def save(path: str | os.PathLike, tree: PyTree) -> None:
 def load(path: str | os.PathLike, classes: Classes = ()) -> Any:
     """Loads what `save` or a person wrote to a file.
 
-    Objects are made by their constructors, which check their arguments. Nothing else is
-    executed, and the memory is a small multiple of the file's size.
+    Constructors make the objects and check their arguments. Nothing else is executed,
+    and the memory used is a small multiple of the file's size.
 
     **Arguments:**
 
@@ -112,12 +112,12 @@ def load(path: str | os.PathLike, classes: Classes = ()) -> Any:
 
     **Returns:** the tree, on the default device. Numbers are equal to the last bit.
     Arrays have JAX's default dtypes: float64 with double precision, float32 without,
-    integers and booleans. An array without axes is a Python number, and a list a tuple,
-    unless the constructor converts it.
+    integers and booleans. An array without axes becomes a Python number, and a list a
+    tuple, unless the constructor converts it.
 
-    **Raises:** FileNotFoundError if there is no file. ValueError, with the file and
-    the place in it, if it is no JSON or cut short, is of a newer version, names unknown
-    classes or arguments, or if a constructor raises it.
+    **Raises:** FileNotFoundError if there is no file. ValueError, with the file and the
+    place in it, if the file is no JSON, is cut short, comes from a newer version, or
+    names unknown classes or arguments, and if a constructor raises it.
     """
     path = file_path("path", path)
     several = isinstance(classes, tuple | list)

@@ -34,14 +34,15 @@ def to_xarray(linkage: Linkage, solution: Solution) -> "xarray.Dataset":
     """Converts a solution to an xarray Dataset, with names and units.
 
     The Dataset holds joint positions `q` and velocities `qd` over `time` and `joint`,
-    and the solution's `outcome`, `num_steps` and `time_reached` for each trajectory; of
-    `simulate_sampled` it holds the `outcome` alone. Where elements hold joints, it also
-    holds the `modes` of each joint, as numbers, and the energy `taken` (see
-    `Solution`). The joints are named R1, P2 and so on, with the coordinate `unit`; a
-    joint of both kinds within a batch is named by its number. Batch axes come first, as
-    `batch` (or `batch_1`, `batch_2` and so on). To name an axis and give it values, use
-    `.rename(batch="payload").assign_coords(payload=masses)`. States of elements and
-    events are not in it: to go on from a motion, save its last state and `own`.
+    and the solution's `outcome`, `num_steps` and `time_reached` for each trajectory;
+    for `simulate_sampled`, `outcome` alone. Where elements hold joints, it also holds
+    the `modes` of each joint, as numbers, and the energy `taken` (see `Solution`). The
+    joints are named R1, P2 and so on, with the coordinate `unit`; a joint of both kinds
+    within a batch is named by its number. Batch axes come first, as `batch` (or
+    `batch_1`, `batch_2` and so on). To name an axis and give it values, use
+    `.rename(batch="payload").assign_coords(payload=masses)`. The Dataset leaves out
+    states of elements and events: to go on from a motion, save its last state and
+    `own`.
 
     **Arguments:** `linkage`: that of the solution, one or a batch; `solution`: result
     of `simulate` or `simulate_sampled`, of a batch of it, or of `sweep`, all at the
@@ -49,7 +50,7 @@ def to_xarray(linkage: Linkage, solution: Solution) -> "xarray.Dataset":
 
     **Returns:** the Dataset; the attributes `units` of its variables are SI.
 
-    **Raises:** ImportError without xarray, which `fdof_jax[data]` brings; ValueError
+    **Raises:** ImportError without xarray, which `fdof_jax[data]` installs; ValueError
     for malformed arguments.
     """
     xarray = optional_package("xarray", "data")
@@ -85,16 +86,17 @@ def to_pandas(linkage: Linkage, solution: Solution) -> "pandas.DataFrame":
     """Converts a solution to a pandas DataFrame with a row per time.
 
     There is a column per joint position and velocity, named `R1 [rad]`, `P2 [m/s]` and
-    so on; where elements hold joints, `R1 held by` tells by what (`free` if by
-    nothing), and `taken [J]` the energy that they have taken. The last column is the
-    `outcome` of the row's trajectory. The index is the time, `time [s]`. For a batch,
-    the levels before it are `batch` (or `batch_1`, `batch_2` and so on).
+    so on. Where elements hold joints, `R1 held by` names what holds the joint (`free`
+    if nothing does), and `taken [J]` is the energy that the elements have taken. The
+    last column is the `outcome` of the row's trajectory. The index is the time, `time
+    [s]`. For a batch, the levels before it are `batch` (or `batch_1`, `batch_2` and so
+    on).
 
     **Arguments:** as in `to_xarray`.
 
     **Returns:** the DataFrame.
 
-    **Raises:** ImportError without pandas, which `fdof_jax[data]` brings; ValueError
+    **Raises:** ImportError without pandas, which `fdof_jax[data]` installs; ValueError
     for malformed arguments.
     """
     pandas = optional_package("pandas", "data")
