@@ -84,13 +84,13 @@ def draw_linkage(
     rail of length B. Fictitious joints are not drawn. The tip is an orange dot. A mass
     centre is a dot in its link's colour, joined to the link if it lies beside it.
 
-    Of the force elements, those with a place are drawn: springs, dampers, cables (which
-    hang if slack), bumpers, cylinders, wrenches as arrows, payloads as boxes while they
-    are taken, stops (also `HardStops`) as bars at the ends of a joint's range, and of a
-    controller the path on which it leads the tip, dashed. `Brake` and `JointFriction`
-    have no symbol, nor have dampers and springs of joints. The longest arrow is that of
-    the greatest force. Thin lines join points beside their link to it, and hatched
-    ground holds points of the ground.
+    Force elements that have a place are drawn too: springs, dampers, cables (which hang
+    if slack), bumpers, cylinders, wrenches as arrows, payloads as boxes while they are
+    taken, stops (also `HardStops`) as bars at the ends of a joint's range, and the path
+    on which a controller leads the tip, dashed. `Brake`, `JointFriction`, and dampers
+    and springs of joints have no symbol. The longest arrow is that of the greatest
+    force. Thin lines join points beside a link to the link, and hatched ground holds
+    points of the ground.
 
     **Arguments:** `q`: joint positions [m or rad]; `forces`: elements, drawn as they
     are at time 0; `color`: common colour of all links, by default one per link;
@@ -125,8 +125,8 @@ def chrono_cyclograph(
     """Draws configurations at equal time steps, from faint to full, and the tip's path.
 
     The picture is that of the paper's Figs 3, 5 and 7. The last configuration has all
-    its parts, the others only links and rails. A dot on the path marks each step, and a
-    few dots have their time, where it hides nothing.
+    its parts, the others only links and rails. A dot on the path marks each step. A few
+    dots carry their time, where it hides nothing.
 
     **Arguments:** `every`: time step [s], at which the nearest samples are drawn;
     `until`: last time, by default the solution's [s]; `mass_centers`: whether to draw

@@ -69,10 +69,10 @@ def motion_profile(
     prismatic joints [m], by the joints' names. Dashed lines are references. A thick
     line, "held" in the legend, marks where something holds a joint.
 
-    **Arguments:** `forces`: those of the solution, of which controllers have the
-    references; `absolute`: whether to show the angles of links from the x axis, theta_k
-    that of link k, as in the paper's Figs 4 and 6, instead of those from the link
-    before; `title`: of the figure.
+    **Arguments:** `forces`: those of the solution, whose controllers have the
+    references; `absolute`: whether to show the angle theta_k of each link k from the x
+    axis, as in the paper's Figs 4 and 6, instead of that from the link before; `title`:
+    of the figure.
     """
     ts, q, _ = reached(linkage, solution)
     instance("absolute", absolute, bool)
@@ -169,15 +169,16 @@ def energy_stack(
     force elements included), and the energy taken out by the forces since the start.
     The dashed line is the energy at the start plus the energy put in by the forces; it
     is level if none is put in. The top of the stack lies on this line up to errors of
-    the motion and of the work between its samples, found by the trapezoidal rule. It
-    does not resolve what efforts do between two samples, as a contact, a jump, or a
-    command that begins to act there: such a part of the picture needs closer samples.
+    the motion and of the work between its samples, found by the trapezoidal rule. A
+    contact, a jump, or a command that begins to act between two samples is not
+    resolved: such a part of the picture needs closer samples.
 
     A force element puts energy in while its power is positive, and takes it out while
-    its power is negative. A motor may do both. What friction, blows, brakes and catches
-    take is that of `solution.taken` since the start. Masses put in their energies where
-    they come, and take them out where they go, as a `Payload` that is let go; heights
-    count from the ground pivot, so that one below it has a negative potential energy.
+    its power is negative. A motor may do both. `solution.taken` gives the energy taken
+    by friction, blows, brakes and catches since the start. A mass puts in its energy
+    when it arrives, and takes it out when it leaves, as a `Payload` that is let go.
+    Heights count from the ground pivot, so that a mass below it has a negative
+    potential energy.
 
     **Arguments:** `forces`: those of the solution.
     """
@@ -200,9 +201,9 @@ def effort_profile(
     """Plots the efforts of each element over time, a panel per joint [N or N m].
 
     The grey band lies within the finite limits of a controller, alone or in a drive,
-    where the efforts come near them; the label tells them all. Orange dots mark samples
-    at which the controller is at its limit. If nearly all changes come in a
-    short part of the time, panels on the left show it larger.
+    where the efforts come near them; the label gives all limits. Orange dots mark
+    samples at which the controller is at its limit. If nearly all changes come in a
+    short part of the time, panels on the left enlarge it.
 
     **Arguments:** `forces`: those of the solution.
     """

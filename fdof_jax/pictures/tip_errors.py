@@ -85,8 +85,8 @@ def tracking(
 ) -> Axes:
     """Plots paths of the tip with the commanded path, dashed; dots are the starts.
 
-    Drawn into the axes of `chrono_cyclograph`, it adds the commanded path of the
-    paper's Fig 7. Call the motion "tip" there, as the path is drawn already.
+    In the axes of `chrono_cyclograph` it adds the commanded path of the paper's Fig 7.
+    Label the motion "tip" there, because its path is drawn already.
 
     **Arguments:** `task`: a `CircleTask` or a `TipTask`, whose `tip(t)` is the
     commanded tip position [m]; `solutions`: one curve per label.
