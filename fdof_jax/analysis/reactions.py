@@ -28,9 +28,8 @@ def _loads(
         loads = element.loads_on_points(t, q, qd, qdd, linkage)
         if loads is None:
             raise ValueError(
-                f"forces[{index}]: expected an element that moves masses to have a "
-                "method `loads` that says which points of links carry them, got "
-                f"{shown(element)}."
+                f"forces[{index}]: expected a method `loads` that returns the loads of "
+                f"its masses on points of links, got none in {shown(element)}."
             )
         for load in loads:
             about_pivot = load.moment + cross(load.point.place(parts), load.vector())

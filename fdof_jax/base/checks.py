@@ -241,7 +241,7 @@ def single_precision(name: str, tree: PyTree) -> None:
     if short and jnp.result_type(float) == jnp.float64:
         warn(
             f"{name}: expected numbers in double precision, got some in float32, made "
-            "before it was set (fdof_jax.configure(x64=True)); build it again."
+            "before fdof_jax.configure(x64=True); build it again."
         )
 
 
@@ -274,7 +274,7 @@ def hashable(name: str, functions: PyTree) -> None:
         try:
             hash(leaf)
         except TypeError:
-            expected = "what can be hashed, as a key of compiled programs"
+            expected = "hashable values, as keys of compiled programs"
             raise refusal(name, expected, leaf) from None
 
 

@@ -22,8 +22,8 @@ class Frozen(eqx.Module):
             super().__setattr__(name, value)
         except FrozenInstanceError:
             raise FrozenInstanceError(
-                f"{name}: a {type(self).__name__} does not change; its "
-                f"replace({name}=...) returns another."
+                f"{name}: a {type(self).__name__} is immutable; its "
+                f"replace({name}=...) returns a changed copy."
             ) from None
 
     def arguments(self) -> dict[str, Any]:
@@ -35,8 +35,8 @@ class Frozen(eqx.Module):
         fields, names = vars(self), inspect.signature(type(self)).parameters
         if missing := [name for name in names if name not in fields]:
             raise TypeError(
-                f"{type(self).__name__}: expected a method `arguments`, as the "
-                f"constructor has arguments that are no fields: {', '.join(missing)}."
+                f"{type(self).__name__}: expected a method `arguments`, because some "
+                f"arguments of the constructor are no fields: {', '.join(missing)}."
             )
         return {name: fields[name] for name in names}
 

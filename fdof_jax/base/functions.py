@@ -208,8 +208,8 @@ def _warn_of_third(trees: dict[str, PyTree]) -> None:
             name = code.code.co_qualname if code else type(leaf).__qualname__
             warn(
                 f"{place}: expected the same function at each call, got a third one "
-                f"like {name}; each needs a program of its own, compiled in seconds "
-                "and tens of megabytes. Define it once, outside of loops, or as an "
-                "Equinox module (an Element), whose arrays are data."
+                f"like {name}; each compiles a program of its own, in seconds and "
+                "tens of megabytes. Define the function once, outside of loops, or as "
+                "an Equinox module (an Element), whose arrays are data."
             )
         alike.add(key)

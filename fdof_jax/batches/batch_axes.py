@@ -41,8 +41,8 @@ def _has_axis(path: tuple[Any, ...], array: Array | np.ndarray, joints: int) -> 
     if not fits or path[-1].name in State._fields and shape[-1] != joints:
         own = f"({joints},)" if path[-1].name in State._fields else f"{rank} dimensions"
         raise ValueError(
-            f"{_name(*path)}: expected real numbers of {own}, or of a batch axis "
-            f"before, got {array.dtype} of shape {shape}."
+            f"{_name(*path)}: expected real numbers of {own}, with or without a "
+            f"leading batch axis, got {array.dtype} of shape {shape}."
         )
     return array.ndim > rank
 

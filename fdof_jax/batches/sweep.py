@@ -220,7 +220,7 @@ def sweep(
     if shard >= of:
         raise refusal("shard", f"a whole number below of={of}", shard)
     if store is None and of > 1:
-        raise refusal("store", "a folder, as of is given", store)
+        raise refusal("store", "a folder, because `of` is given", store)
     settings = solve_options(
         solver=solver,
         rtol=rtol,

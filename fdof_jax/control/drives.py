@@ -65,7 +65,7 @@ class PIDController(StatefulElement):
 
     def conditions(self):
         paired = ((self.ki <= 0) | (self.pd.kp > 0)).all()
-        yield Condition(paired, "ki", "0 where kp is", (self.ki, self.pd.kp))
+        yield Condition(paired, "ki", "0 where kp is 0", (self.ki, self.pd.kp))
 
     def initial_state(self, linkage):
         """Returns the integral's share at the start: zeros (n,) [N or N m]."""

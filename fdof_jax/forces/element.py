@@ -162,7 +162,7 @@ def naming(place: str) -> Iterator[None]:
         reason = str(error).partition("\n")[0].rstrip(".")
         raise TypeError(
             f"{place}: expected jax.numpy in its functions, and no `if` on t, q or qd "
-            f"(jnp.where and fdof_jax.forces.switch choose), got: {reason}."
+            f"(use jnp.where or fdof_jax.forces.switch), got: {reason}."
         ) from error
     except ValueError as error:
         name, colon, _ = str(error).partition(": ")

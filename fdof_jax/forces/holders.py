@@ -310,8 +310,8 @@ def check_free(name: str, element: object) -> None:
     if isinstance(element, Holder) and element.holds:
         raise refusal(
             name,
-            "no element that holds joints, as only motions have modes; without it "
-            "they are free, and a fixed pair (F) holds one; JointStops, and "
-            "JointFriction given a speed, hold none",
+            "no element that holds joints, because only motions have modes (leave it "
+            "out for free joints, or hold a joint by a fixed pair, F; JointStops and "
+            "JointFriction with a speed hold none)",
             element,
         )

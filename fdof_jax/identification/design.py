@@ -207,7 +207,8 @@ def next_motion(
                     f"{[int(i) for i in entry]}."
                 )
         raise ValueError(
-            "start: expected a motion with finite readings and derivatives, got others."
+            "start: expected a motion with finite readings and derivatives, got some "
+            "that are not finite."
         )
     errors = run.best.facts["errors"][0]
     before = np.sqrt(np.diag(found.covariance)) / sizes

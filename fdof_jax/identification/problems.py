@@ -112,8 +112,8 @@ def unknowns_of(
         )
         if not ((low <= first) & (first <= high)).all():
             raise ValueError(
-                f"{place}: expected the start between them, got {shown(pair)} around "
-                f"{shown(first.tolist())}."
+                f"{place}: expected bounds around the start, {shown(first.tolist())}, "
+                f"got {shown(pair)}."
             )
         shapes.append((name, shape))
         columns.append([np.ravel(array) for array in (first, size, low, high)])

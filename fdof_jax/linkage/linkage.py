@@ -153,8 +153,8 @@ def per_joint(name: str, values: ArrayLike, linkage: Linkage) -> Array:
     n = joints_of(linkage)
     if isinstance(values, jax.Array | np.ndarray) and values.ndim > 1:
         raise ValueError(
-            f"{name}: expected one instant, numbers for {n} joints, got shape "
-            f"{np.shape(values)}; jax.vmap computes many."
+            f"{name}: expected numbers for {n} joints at one instant (use jax.vmap for "
+            f"many), got shape {np.shape(values)}."
         )
     array = real_array(name, values, (n,), of=f"{n} joints")
     if name.rpartition(".")[2] == "q":  # positions, also those of a state

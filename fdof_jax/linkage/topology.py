@@ -64,8 +64,8 @@ def pairs_of(topology: Any) -> np.ndarray | None:
             ef = np.empty(0)
         if ef.ndim > 1:
             raise ValueError(
-                f"{expected}, got shape {ef.shape}. Arms of a batch are made and "
-                "changed one by one, within jax.vmap."
+                f"{expected}, got shape {ef.shape}. Make and change the arms of a "
+                "batch one by one, within jax.vmap."
             )
         if ef.ndim != 1 or ef.size not in _SIZES or not np.isin(ef, (0, 1)).all():
             raise ValueError(f"{expected}, got {shown(topology)}.")

@@ -57,7 +57,7 @@ def mark_end(axes: Iterable[Axes], solution: Solution, last: float) -> None:
 def filled_mapping(name: str, value: object, kind: str) -> Mapping:
     """Returns `value` if it is a nonempty dictionary, else raises ValueError."""
     if not isinstance(value, Mapping) or not value:
-        raise refusal(name, f"a dictionary, not empty, of label: {kind}", value)
+        raise refusal(name, f"a non-empty dictionary of label: {kind}", value)
     return value
 
 

@@ -61,7 +61,7 @@ def ode_term(scene: Scene) -> tuple[diffrax.ODETerm, _Y, Args]:
     if prescribed(forces) is not None or changes(forces):
         raise ValueError(
             "scene.forces: expected no PrescribedMotion, and no Payload with a begin, "
-            "as only simulate knows their blows, got one."
+            "because only simulate computes their blows, got one."
         )
     q, qd = (without_fixed(linkage, jnp.asarray(value)) for value in start)
     args = args_of(linkage, q, forces)

@@ -91,8 +91,8 @@ def _of_switches(inputs: Inputs, keywords: Settings) -> str:
             continue
         if isinstance(element, Reset):
             return (
-                f"forces[{k}] (Reset) resets the state ever faster there, as that of a "
-                "ball which comes to rest: HardStops hold what rests."
+                f"forces[{k}] (Reset) resets the state ever faster there, as for a "
+                "ball that comes to rest: use HardStops to hold what rests."
             )
         by_rate, by_position = (
             {
@@ -141,7 +141,7 @@ def _of_steps(inputs: Inputs, keywords, solution: Solution) -> str:
     if grows and rate * mean > _STABLE:
         return (
             f"There the motion grows by a rate of {rate:.3g}/s, as under a force that "
-            "feeds itself: it diverges, and more max_steps hardly help."
+            "feeds itself. It diverges: more max_steps hardly help."
         )
     if solution.outcome != "out of steps":
         return OUTCOMES[str(solution.outcome)]
@@ -184,9 +184,8 @@ def _of_singular_arm(linkage: Linkage, q: Array) -> str:
         return ""
     return (
         " The tip's Jacobian J is singular there, or nearly (condition number "
-        f"{condition:.2g}), as of an arm that is straight or folded: an effort "
-        "that inverts J has no bound there; one by a damped inverse, "
-        "J^T (J J^T + c I)^-1, has one."
+        f"{condition:.2g}), as in a straight or folded arm: an effort that inverts J "
+        "is unbounded there. The damped inverse, J^T (J J^T + c I)^-1, bounds it."
     )
 
 

@@ -69,7 +69,7 @@ def solve_options(
         raise refusal(
             "adjoint",
             f"{expected}ForwardMode; the gradients of BacksolveAdjoint are wrong on "
-            "these problems, and no other has a meaning for them",
+            "these problems, and other adjoints do not apply",
             adjoint,
         )
     instance("throw", throw, bool)
@@ -145,8 +145,8 @@ def check_start(
     if not leaves_prescribed(forces, linkage):
         raise ValueError(
             "forces: expected no HardStops and no Brake at a joint whose motion is "
-            "prescribed, which they cannot stop, got some (limits of -inf and inf are "
-            "none)."
+            "prescribed, because they cannot stop it (limits of -inf and inf count as "
+            "none), got some."
         )
     if motion is not None and not agrees(forces, ts[0], q, linkage):
         begin, _ = motion.at(ts[0], linkage)
@@ -255,7 +255,7 @@ def simulate(
         if "forward-mode" in str(error) or isinstance(error, StopIteration):
             raise TypeError(
                 "forward-mode differentiation of simulate needs "
-                "adjoint=diffrax.ForwardMode(); for second derivatives take "
+                "adjoint=diffrax.ForwardMode(); for second derivatives use "
                 "jax.jacfwd(jax.jacfwd(...)) with it, not jax.hessian."
             ) from error
         raise

@@ -27,12 +27,12 @@ OUTCOMES = {
     "successful": "",
     "ill-conditioned": "The mass matrix is singular there, or nearly so (see "
     "inertia_ratios).",
-    "not finite": "The accelerations are not finite there, as where a reference is out "
-    "of reach (references.reach_margin says by how much).",
+    "not finite": "The accelerations are not finite there, for instance because a "
+    "reference is out of reach (references.reach_margin says by how much).",
     "out of steps": "All max_steps were taken before the end.",
-    "tolerance out of reach": "Not even the shortest step meets the tolerance: "
-    "rounding keeps it from that, or an effort jumps there (forces.switch makes steps "
-    "end at jumps).",
+    "tolerance out of reach": "Not even the shortest step meets the tolerance, because "
+    "of rounding or of an effort that jumps there (forces.switch makes steps end at "
+    "jumps).",
     "too many switches": "Elements switch there without end, as between branches that "
     "push towards each other: let joints stick by a JointFriction, or let the effort "
     "change continuously, as by a clipped gain in place of a sign.",
@@ -226,7 +226,7 @@ class Solution(eqx.Module):
         """
         if is_traced(self.result):
             raise ValueError(
-                "outcome: expected a computed motion, got one that JAX traces; there, "
+                "outcome: expected a computed motion, got a traced one; while tracing, "
                 "compare `result`: motion.result == diffrax.RESULTS.successful."
             )
         words = np.asarray(np.array([*OUTCOMES])[outcome_numbers(self.result)])
