@@ -5,21 +5,21 @@
     scene = fj.scenes.fig7()                   # or your own Linkage, State and elements
     motion = fj.simulate(scene, [0, scene.t1])
 
-Units are SI. `help` of a name says the rest; its room holds more of its kind.
+Units are SI. `help(fj.simulate)` documents a name; submodules hold more names.
 
 - **Arms**: Linkage, State, Scene, TOPOLOGIES, existence_factors, joint_positions,
   mass_centers, tip_position, tip_jacobian, inverse_kinematics.
-- **What acts**, room `forces`: JointDamper, JointEffort, SpringDamper, Wrench, Point,
-  LinearActuator. Of your own: Element, field, Values.
-- **Controllers**, rooms `control` and `references`: PDController, TipTask, CircleTask.
-- **Motions**, room `simulation`: simulate, sweep for many, simulate_sampled and step
-  for controllers on a clock; Solution.
+- **Forces**, more in `forces`: JointDamper, JointEffort, SpringDamper, Wrench, Point,
+  LinearActuator. For your own: Element, field, Values.
+- **Controllers**, more in `control` and `references`: PDController, TipTask, CircleTask.
+- **Motions**, more in `simulation`: simulate, sweep for many, simulate_sampled and step
+  for sampled controllers; Solution.
 - **At one instant**: forward_dynamics, inverse_dynamics, mass_matrix, bias_force,
   energy, link_energies. The paper's six equations: paper.
-- **Afterwards**, room `analysis`: joint_efforts, joint_reactions, linearize.
-- **Gains**, room `tuning`: tune, TuneResult. **Parameters from recordings**, room
-  `identification`: fit, FitResult.
-- **Pictures**: view, drawing, plotting. **Files and tables**, room `data`: save,
+- **Analysis**, more in `analysis`: joint_efforts, joint_reactions, linearize.
+- **Gains**, more in `tuning`: tune, TuneResult. **Parameters from recordings**, more
+  in `identification`: fit, FitResult.
+- **Pictures**: view, drawing, plotting. **Files and tables**, more in `data`: save,
   load, to_pandas, to_xarray, to_mjcf, from_mjcf.
 - **The paper's figures**: scenes.
 """
