@@ -11,7 +11,7 @@ Units are SI. `help(fj.simulate)` documents a name; submodules hold more names.
   mass_centers, tip_position, tip_jacobian, inverse_kinematics.
 - **Forces**, more in `forces`: JointDamper, JointEffort, SpringDamper, Wrench, Point,
   LinearActuator. For your own: Element, field, Values.
-- **Controllers**, more in `control` and `references`: PDController, TipTask, CircleTask.
+- **Controllers**, more in `control`, `references`: PDController, TipTask, CircleTask.
 - **Motions**, more in `simulation`: simulate, sweep for many, simulate_sampled and step
   for sampled controllers; Solution.
 - **At one instant**: forward_dynamics, inverse_dynamics, mass_matrix, bias_force,

@@ -357,9 +357,9 @@ def constraint_forces(
 ) -> Float[Array, " chain"]:
     """Computes the generalised constraint forces at fictitious joints, (16)-(26).
 
-    Each fictitious joint adds this force to its command in `force` to stand still. The
-    balance (15) gives it from the accelerations, from the tip inwards. This equals the
-    printed forms ((24) prints an equals sign for a plus).
+    This force, added to a fictitious joint's command in `force`, keeps the joint still.
+    The balance (15) gives it from the accelerations, from the tip inwards. The result
+    equals the printed forms ((24) prints an equals sign for a plus).
 
     **Arguments:** as for `masked_accelerations`.
 

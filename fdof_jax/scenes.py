@@ -99,7 +99,7 @@ def fig7() -> Scene:
 def double_pendulum() -> Scene:
     """A conservative double pendulum of two rods of 1 kg and 1 m, released raised.
 
-    It moves for 10 s in the plane of gravity, from 0.5 rad above the level [rad].
+    It moves for 10 s in a vertical plane, from 0.5 rad above the horizontal [rad].
 
     >>> import fdof_jax as fj
     >>> fj.scenes.double_pendulum().linkage.mass.tolist()  # [kg]
@@ -116,7 +116,7 @@ def double_pendulum() -> Scene:
 
 
 def cart_pole() -> Scene:
-    """A pole that hangs from a cart on a level rail, 0.2 rad away from rest.
+    """A pole that hangs from a cart on a horizontal rail, 0.2 rad from equilibrium.
 
     The ground's frame points down: the cart slides along x [m], and at an angle of 0
     the pole hangs [rad].
@@ -138,10 +138,10 @@ def cart_pole() -> Scene:
 
 
 def two_link_circle() -> Scene:
-    """A two-link arm under PD control whose tip tracks a circle, in a level plane.
+    """A two-link arm in a horizontal plane, whose tip tracks a circle by PD control.
 
-    The circle has a radius of 0.3 m and a period of 2 s; the tip starts 0.1 m beside
-    it [m].
+    The circle has a radius of 0.3 m and a period of 2 s; the tip starts 0.1 m off it
+    [m].
 
     >>> import fdof_jax as fj
     >>> arm, start, (control,), t1 = fj.scenes.two_link_circle()

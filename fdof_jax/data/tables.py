@@ -44,9 +44,9 @@ def to_xarray(linkage: Linkage, solution: Solution) -> "xarray.Dataset":
     states of elements and events: to go on from a motion, save its last state and
     `own`.
 
-    **Arguments:** `linkage`: that of the solution, one or a batch; `solution`: result
-    of `simulate` or `simulate_sampled`, of a batch of it, or of `sweep`, all at the
-    same times [s].
+    **Arguments:** `linkage`: that of the solution, one or a batch; `solution`: a result
+    of `simulate`, `simulate_sampled` or `sweep`, one motion or a batch at the same
+    times [s].
 
     **Returns:** the Dataset; the attributes `units` of its variables are SI.
 

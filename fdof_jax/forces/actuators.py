@@ -158,7 +158,7 @@ class LinearActuator(Between, InertialElement):
     def loads(
         self, t: Array, q: Array, qd: Array, qdd: Array, linkage: Linkage
     ) -> tuple[Load, Load]:
-        """Loads of the pins on the links: the force between them, weight and inertia.
+        """Returns the pins' loads on the links: the force, weight and inertia.
 
         The moments about the first pin determine each pin's sideways share.
         """

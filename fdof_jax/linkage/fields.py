@@ -69,10 +69,10 @@ def field(
     - `shape`: by default one number per joint, or one for all (then `each` repeats it);
       `None` within it stands for any length, "joint" for the number of joints.
     - `unit`: for messages, for instance "N m s/rad".
-    - `minimum`, `above`: lower bounds, with or without the bound itself; `finite`:
-      whether infinities are rejected.
-    - `function`: whether a function that returns such an array is accepted; `optional`:
-      whether None is accepted, as it is wherever it is the default.
+    - `minimum`, `above`: lower bounds, inclusive and exclusive; `finite`: whether
+      infinities are rejected.
+    - `function`, `optional`: whether a function that returns such an array, or None, is
+      accepted; None always is where it is the default.
     - `rows`: an array of so many rows, each like `shape`, is accepted as well.
     - `default`, `kw_only`: as of `dataclasses.field`.
     """

@@ -130,8 +130,8 @@ def simulate_sampled(
     - `period`: time between samples [s]; `samples`: number of samples.
     - `forces`: other force elements.
     - `t0`: time of the first sample [s].
-    - `delay`: time from measurement to action [s], which may be longer than a period.
-      The effort is zero until the first command acts. As a function of the delay, the
+    - `delay`: time from measurement to action [s], possibly longer than a period. The
+      effort is zero until the first command acts. As a function of the delay, the
       motion has a kink at each whole number of periods; derivatives there are those of
       longer delays. Each number of whole periods compiles its own program; all traced
       delays share one. A traced delay below 0 ends the motion as not finite.
