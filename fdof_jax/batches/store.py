@@ -74,7 +74,7 @@ def _named(value: PyTree) -> dict[str, PyTree]:
             name = name.removeprefix("stats_")
         # Some file systems do not tell capitals from small letters.
         if name.casefold() in taken:
-            expected = "parts whose names differ in letters, none of them failed"
+            expected = "part names that differ in more than case, none named failed"
             raise refusal("reduce", expected, name)
         taken.add(name.casefold())
         named[name] = leaf

@@ -179,7 +179,7 @@ def _node(place: str, value: PyTree) -> Json:
     if kind is float or isinstance(value, jax.Array | np.ndarray | np.generic):
         return _numbers(place, value)
     if isinstance(value, Solution):
-        expected = "no motion: to_xarray makes a Dataset of it, which to_netcdf saves"
+        expected = "no motion (to_xarray makes a Dataset, whose to_netcdf saves it)"
         raise refusal(place, expected, value)
     if not _is_record(kind):
         expected = "numbers, arrays, texts, tuples, dicts with text keys, or objects"
@@ -211,7 +211,7 @@ def _object(place: str, value: Any) -> dict[str, Json]:
     public = _public(name)
     ours = public or name in _WORDS or kind.__module__.startswith(f"{_PACKAGE}.")
     if public is not kind and ours:
-        expected = "an object of a public class, or of your own of another name"
+        expected = "an object of a public class, or of your own class of another name"
         raise refusal(place, expected, kind)
     if isinstance(value, tuple):
         arguments = value._asdict()  # pyright: ignore[reportAttributeAccessIssue]
@@ -224,7 +224,7 @@ def _object(place: str, value: Any) -> dict[str, Json]:
             with without_warning(""):  # which came when it was made
                 kind(**arguments)  # as `load` does
         except _MEANT as error:
-            expected = f"a {name} that its constructor makes again"
+            expected = f"a {name} that its constructor reproduces"
             other = "equinox.tree_serialise_leaves writes networks and batches"
             problem = f"{expected} ({other}); {plain(str(error))}"
             raise ValueError(f"{place}: expected {problem}") from error

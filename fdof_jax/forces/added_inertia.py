@@ -31,7 +31,7 @@ def _without_times(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
     found = elements_on(linkage, forces)
     for index, element in enumerate(found):
         if isinstance(element, InertialElement) and element.at(_ANY) is not element:
-            expected = "masses of one time, its `at(t)`, as no time is given here"
+            expected = "masses of one time (its `at(t)`), because no time is given"
             raise refusal(f"forces[{index}]", expected, element)
     return found
 
