@@ -140,7 +140,7 @@ def cart_pole() -> Scene:
 def two_link_circle() -> Scene:
     """A two-link arm in a horizontal plane, whose tip tracks a circle by PD control.
 
-    The circle's radius is 0.3 m [m] and its period 2 s; the tip starts 0.1 m off it.
+    The circle has a radius of 0.3 [m] and a period of 2 [s]; the tip starts 0.1 m off.
 
     >>> import fdof_jax as fj
     >>> arm, start, (control,), t1 = fj.scenes.two_link_circle()

@@ -173,8 +173,8 @@ def linearize(
     the state is then the scene's start.
 
     **Returns:** `A` and `B` of d(q, qd)/dt = A (q, qd) + B tau, for small changes. The
-    efforts tau act in the joints in addition to the forces [N or N m]. A force with
-    kinks has its slope at the state: a controller at its limit has no gains.
+    efforts tau act in the joints in addition to the forces [N or N m]. For a force with
+    kinks, the slope at the state counts: a controller at its limit has no gains.
 
     **Raises:** ValueError for malformed arguments.
 

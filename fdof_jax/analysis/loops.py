@@ -34,8 +34,8 @@ def open_loop(
     """Breaks the loop of a controller at one joint's effort, about a configuration.
 
     The controller keeps acting in the other joints. Constant efforts hold the arm at
-    rest at `q`. A controller with kinks has its slope there: at its limit it has no
-    gains, so place `q` near its reference.
+    rest at `q`. For a controller with kinks, the slope there counts: at its limit it
+    has no gains, so place `q` near its reference.
 
     **Arguments:**
 
