@@ -174,9 +174,10 @@ def sweep(
     - `forces`: force elements; `forces_axes`: which of their arrays carry the batch
       axis, as `in_axes` of `jax.vmap`: 0 for all, None (the default) for none, or a
       tuple of these with one entry per element.
-    - `reduce`: a function of one member's `Scene` and `Solution`, for instance `lambda
-      scene, motion: motion.q[-1]`, or a loss of `tune`. Of each member, only the arrays
-      that it returns are kept. Functions of equal code share a compiled program.
+    - `reduce`: a function of one member's `Scene` and `Solution`, for example
+      `lambda scene, motion: motion.q[-1]`, or a loss of `tune`. Of each member, only
+      the arrays that it returns are kept. Functions of equal code share a compiled
+      program.
     - `chunk`: largest number of members to solve together, per device; None stands for
       256, or 64 where elements hold joints.
     - `throw`: whether to raise an error if any member fails.

@@ -88,9 +88,9 @@ def to_pandas(linkage: Linkage, solution: Solution) -> "pandas.DataFrame":
     There is a column per joint position and velocity, named `R1 [rad]`, `P2 [m/s]` and
     so on. Where elements hold joints, `R1 held by` names what holds the joint (`free`
     if nothing does), and `taken [J]` is the energy that the elements have taken. The
-    last column is the `outcome` of the row's trajectory. The index is the time, `time
-    [s]`. For a batch, the levels before it are `batch` (or `batch_1`, `batch_2` and so
-    on).
+    last column is the `outcome` of the row's trajectory. The index is the time,
+    `time [s]`. For a batch, the levels before it are `batch` (or `batch_1`, `batch_2`
+    and so on).
 
     **Arguments:** as in `to_xarray`.
 

@@ -141,9 +141,9 @@ def simulate_sampled(
       sample.
 
     **Returns:** a `Solution` at the sampling times, the end included, with `tau`. For
-    pictures, tables, `joint_efforts` and `joint_reactions`, its `forces` are `(control,
-    *forces)`, the controller first. The controller's efforts are then those that act: 0
-    before the first command arrives.
+    pictures, tables, `joint_efforts` and `joint_reactions`, its `forces` are
+    `(control, *forces)`, the controller first. The controller's efforts are then those
+    that act: 0 before the first command arrives.
 
     **Raises:** ValueError for malformed arguments.
 
