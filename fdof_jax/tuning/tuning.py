@@ -89,7 +89,8 @@ def tune(
 
     **Arguments:**
 
-    - `scene`: a scene with exactly one `PDController`.
+    - `scene`: a scene with exactly one controller of gains: a `PDController`, a
+      `GravityFeedforward` or a `ComputedTorque`.
     - `factor`: the gains stay within this factor of their start, above 1; by default 4.
     - `bounds`: instead of a factor, the least and the greatest kp and kd: two arrays
       (2, n), first row kp, second kd [N/m or N m/rad, N s/m or N m s/rad].
