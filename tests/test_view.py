@@ -22,6 +22,7 @@ from fdof_jax.simulation.solution import Events
 from fdof_jax.viewer.lines import lines_of
 
 ARM, TIP = make_linkage("RPR"), fj.Point(3, 0.6)
+REST = fj.State([0.0] * 3, [0.0] * 3)
 NOWHERE = made_up(SOLUTION.ts, SOLUTION.q * jnp.nan)
 BATCH = made_up(SOLUTION.ts, jnp.stack([SOLUTION.q] * 3), jnp.zeros((3, 5, 3)))
 
@@ -175,10 +176,31 @@ def test_a_notebook_shows_the_page(show):
     assert "<script" not in frame and frame.startswith("<iframe")
 
 
-def test_a_scene_stands_for_its_parts(tmp_path):
-    path = str(tmp_path / "a.html")
-    scene = fj.Scene(LINKAGE, fj.State([0.0] * 3, [0.0] * 3), (), 1.0)
-    assert fj.view(scene, SOLUTION, path).path == tmp_path / "a.html"
+def test_scenes_stand_for_linkages_and_their_own_forces(show):
+    motion, forces = swinging(), [(fj.JointDamper(k),) for k in (1.0, 2.0)]
+    before, after = (fj.Scene(ARM, REST, own, 1.0) for own in forces)
+    assert show(before, motion)[1] == show(ARM, motion, forces[0])[1]
+    scenes = {"before": before, "after": after}
+    _, data = show(scenes, dict.fromkeys(scenes, motion))
+    efforts = [
+        [array(data, s["y"]) for s in shown["series"] if s["panel"] == "effort"]
+        for shown in data["motions"]
+    ]
+    np.testing.assert_array_equal(efforts[1], 2 * np.stack(efforts[0]))
+    # One dictionary may hold both kinds.
+    arms, motions = scenes | {"free": ARM}, dict.fromkeys((*scenes, "free"), motion)
+    free = show(arms, motions)[1]["motions"][2]
+    assert free["title"] == "free"
+    assert "effort" not in {s["panel"] for s in free["series"]}
+
+
+def test_the_title_of_the_page_names_the_motions(show):
+    titles = ("a <i>", "b", "c", "d", "e")
+    view, _ = show(LINKAGE, dict.fromkeys(titles, SOLUTION))
+    assert "<title>a &lt;i&gt;, b, c, d, e</title>" in view.html
+    view, _ = show(LINKAGE, dict.fromkeys((*titles, "f"), SOLUTION))
+    assert "<title>a &lt;i&gt;, b, c, d, e, ...</title>" in view.html
+    assert "<title>RRR arm</title>" in show(LINKAGE, SOLUTION)[0].html
 
 
 def test_sampled_motions_come_with_their_control(show):
@@ -195,6 +217,7 @@ def test_sampled_motions_come_with_their_control(show):
 
 
 PAIR = LINKAGE, SOLUTION
+SCENE = fj.Scene(LINKAGE, REST, (), 1.0)
 REFUSED = [
     ("linkage", fj.view, "RRR", SOLUTION),
     ("linkage", fj.view, {"a": LINKAGE}, SOLUTION),
@@ -209,6 +232,12 @@ REFUSED = [
     ("forces", fj.view, *PAIR, fj.JointDamper(1.0)),
     ("forces", fj.view, *PAIR, {"a": ()}),
     ("forces", fj.view, LINKAGE, {"a": SOLUTION}, {"b": ()}),
+    ("forces", fj.view, *PAIR, []),
+    ("forces", fj.view, SCENE, SOLUTION, ()),
+    ("forces", fj.view, {"a": SCENE}, {"a": SOLUTION}, {"a": ()}),
+    ("linkage", fj.view, SCENE, {"a": SOLUTION}),
+    ("linkage", fj.view, {"a": SCENE}, SOLUTION),
+    ("linkage", fj.view, {"a": SCENE}, {"b": SOLUTION}),
     ("path", partial(fj.view, path=3), *PAIR),
     ("path", partial(fj.view, path=""), *PAIR),
     ("path", partial(fj.view, path=Path(__file__).parent), *PAIR),
@@ -222,3 +251,8 @@ def test_malformed_arguments_are_named(tmp_path, monkeypatch):
         with pytest.raises(ValueError, match=f"^{name}: expected"):
             function(*given)
     assert not [*tmp_path.iterdir()]
+
+
+def test_what_messages_leave_out_is_told():
+    with pytest.raises(ValueError, match=r"got Scene\(linkage=.{183}\.{3}\.$"):
+        fj.view(SCENE, {"a": SOLUTION})

@@ -7,7 +7,9 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
-from .. import Linkage, Solution
+from .. import Linkage, Scene, Solution
+
+_MOST_SHOWN = 200  # characters of a message that repeat what was given
 
 
 class Motion(NamedTuple):
@@ -23,7 +25,9 @@ class Motion(NamedTuple):
 def refusal(name: str, expected: str, got: object) -> ValueError:
     """Returns the error to raise for a malformed argument."""
     text = "".join(filter(str.isprintable, " ".join(repr(got).split())))
-    return ValueError(f"{name}: expected {expected}, got {text[:200]}.")
+    if len(text) > _MOST_SHOWN:
+        text = f"{text[: _MOST_SHOWN - 3]}..."
+    return ValueError(f"{name}: expected {expected}, got {text}.")
 
 
 def motions_of(linkage: Any, solution: Any, forces: Any) -> list[Motion]:
@@ -35,6 +39,9 @@ def motions_of(linkage: Any, solution: Any, forces: Any) -> list[Motion]:
                 expected = "no dictionary, as the solution is none"
                 raise refusal(name, expected, given[name])
         return _members("", given, "")
+    if isinstance(linkage, Scene):  # whose forces need not be those of all solutions
+        expected = "a dictionary of Scenes, as the solutions are in one"
+        raise refusal("linkage", expected, linkage)
     if not solution:
         raise refusal("solution", "at least one motion", solution)
     for name, value in given.items():
@@ -55,6 +62,13 @@ def motions_of(linkage: Any, solution: Any, forces: Any) -> list[Motion]:
 
 def _members(title: str, given: dict[str, Any], place: str) -> list[Motion]:
     """Returns a motion, or those of a batch; `place`: of the title, for messages."""
+    scene, forces = given["linkage"], given["forces"]
+    if isinstance(scene, Scene):
+        if forces is not None:
+            raise refusal("forces", "none beside a Scene, which has its own", forces)
+        given = given | {"linkage": scene.linkage, "forces": scene.forces}
+    elif forces is None:
+        given = given | {"forces": ()}
     for name, kind in ("linkage", Linkage), ("solution", Solution):
         if not isinstance(given[name], kind):
             raise refusal(name + place, f"a {kind.__name__}", given[name])

@@ -8,13 +8,13 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from .. import Linkage, Solution
-from ..simulation import accepts_scene
+from .. import Linkage, Scene, Solution
 from .data import page_data
 from .motions import motions_of, refusal
 from .still import still_picture
 
 _TEMPLATE = Path(__file__).with_name("page.html")
+_MOST_NAMED = 5  # motions in the title of the page
 
 
 @dataclass(frozen=True)
@@ -34,11 +34,10 @@ class View:
         )
 
 
-@accepts_scene
 def view(
-    linkage: Linkage | Mapping[str, Linkage],
+    linkage: Linkage | Scene | Mapping[str, Linkage | Scene],
     solution: Solution | Mapping[str, Solution],
-    forces: tuple[Any, ...] | Mapping[str, tuple[Any, ...]] = (),
+    forces: tuple[Any, ...] | Mapping[str, tuple[Any, ...]] | None = None,
     path: str | os.PathLike[str] = "motion.html",
 ) -> View:
     """Writes a page that plays a motion in any browser, and curves over time beside it.
@@ -46,7 +45,8 @@ def view(
     The page is one file, which needs no network: it can be sent by mail. It draws the
     arm and what acts on it as `drawing.draw_linkage` does, the path of the tip, the
     curves of positions [rad, m], velocities, efforts [N m, N] and energies [J], and
-    marks events and what holds joints. Energies are those of `energy` with the forces.
+    marks events and what holds joints. Efforts and energies are computed with the
+    forces given, as `joint_efforts` and `energy` do: give those of the simulation.
     Between two rows positions are interpolated linearly. Numbers have 32 bits.
 
     **Arguments:**
@@ -58,9 +58,9 @@ def view(
     - `linkage`, `forces`: those of the solution. With a dictionary of solutions, each
       may be a dictionary of the same titles; else they are the same for all. A batch of
       arms belongs to a batch of motions; the forces are the same for all its members.
+      A `Scene` stands for a linkage and its forces, which are then left out; beside a
+      dictionary of solutions, Scenes are in a dictionary too.
     - `path`: of the file, which is replaced.
-
-    A `Scene` may stand for linkage and forces: `view(scene, solution)`.
 
     **Returns:** a `View`, with the file's `path`; as the last line of a notebook's cell
     it shows the page.
@@ -71,7 +71,7 @@ def view(
     >>> scene = fj.scenes.fig5()
     >>> motion = fj.simulate(scene, [0, 0.05, 0.1])
     >>> folder = getfixture("tmp_path")
-    >>> fj.view(scene, motion, folder / "fall.html").path.name
+    >>> fj.view(scene, motion, path=folder / "fall.html").path.name
     'fall.html'
     """
     motions = motions_of(linkage, solution, forces)
@@ -79,7 +79,9 @@ def view(
         raise refusal("path", "the path of a file", path)
     # No text in the data ends the script that holds it.
     data = json.dumps(page_data(motions)).replace("<", "\\u003c")
-    title = ", ".join(dict.fromkeys(motion.linkage.topology for motion in motions))
+    title = ", ".join(motion.title for motion in motions[:_MOST_NAMED])
+    if len(motions) > _MOST_NAMED:
+        title += ", ..."
     html = _TEMPLATE.read_text(encoding="utf-8")
     for name, text in (
         ("title", escape(title)),
