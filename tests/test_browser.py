@@ -83,14 +83,16 @@ def place(page, point):
     return np.array([x + scale * point[0], y - scale * point[1]])
 
 
-def tip_drawn(page):
-    """Middle of the tip's mark in the window, which alone has its colour."""
+def tip_drawn(page, near, color="tip"):
+    """Middle of the tip's mark in the window, which alone has its colour near there."""
     return np.array(
-        page.run("""
+        page.run(
+            """
 const canvas = document.getElementById("front"), box = canvas.getBoundingClientRect();
 const {width, height} = canvas;
 const probe = document.body.appendChild(document.createElement("i"));
-probe.style.color = "var(--tip)";
+const [left, top, color] = arguments;
+probe.style.color = `var(--${color})`;
 const wanted = getComputedStyle(probe).color.match(/\\d+/g).map(Number);
 probe.remove();
 const often = {willReadFrequently: true};
@@ -99,14 +101,18 @@ copy.drawImage(canvas, 0, 0);
 const {data} = copy.getImageData(0, 0, width, height);
 let count = 0, x = 0, y = 0;
 for (let k = 0; k < width * height; k++) {
-  const near = c => Math.abs(data[4 * k + c] - wanted[c]) < 3;
-  if (near(0) && near(1) && near(2) && data[4 * k + 3] > 250) {
-    count++; x += k % width + 0.5; y += Math.floor(k / width) + 0.5;
+  const u = k % width + 0.5, v = Math.floor(k / width) + 0.5;
+  const same = c => Math.abs(data[4 * k + c] - wanted[c]) < 3;
+  const near = Math.max(Math.abs(box.x + u - left), Math.abs(box.y + v - top)) < 11.5;
+  if (near && same(0) && same(1) && same(2) && data[4 * k + 3] > 250) {
+    count++; x += u; y += v;
   }
 }
 return [box.x + x / count, box.y + y / count];
-""")
-    )
+""",
+            *map(float, near), color,
+        )
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("size", [(1280, 800), (360, 740)])
@@ -115,11 +121,11 @@ def test_the_scrubber_moves_the_tip_to_its_place(one, size):
     one.press("t", "t")  # without the path, which has the tip's colour
     for row in (0, 37, 100):
         scrub(one, TS[row])
-        tip = np.asarray(fj.tip_position(ARM, Q[row]))
-        assert np.abs(tip_drawn(one) - place(one, tip)).max() < 1
+        tip = place(one, np.asarray(fj.tip_position(ARM, Q[row])))
+        assert np.abs(tip_drawn(one, tip) - tip).max() < 1
     scrub(one, (TS[50] + TS[51]) / 2)
-    tip = np.asarray(fj.tip_position(ARM, (Q[50] + Q[51]) / 2))
-    assert np.abs(tip_drawn(one) - place(one, tip)).max() < 1
+    tip = place(one, np.asarray(fj.tip_position(ARM, (Q[50] + Q[51]) / 2)))
+    assert np.abs(tip_drawn(one, tip) - tip).max() < 1
     assert one.run("return document.documentElement.scrollWidth") == size[0]
     one.size(1280, 800)
 
@@ -182,15 +188,19 @@ def test_the_wheel_zooms_about_the_mouse_and_drags_move(one):
 
 
 def test_motions_are_laid_over_each_other_or_side_by_side(two):
-    title = "return document.querySelector('#notes b').textContent"
+    entries = (
+        "return Array.from(document.querySelectorAll('#legend span'), "
+        "one => [one.textContent, one.className])"
+    )
     two.press("t", "t")
-    for side in (False, True):
-        for title_shown, motion in zip(TITLES, (MOTION, SLOW)):
-            assert two.run(title) == title_shown
+    for _ in range(2):
+        for title, motion, color in zip(TITLES, (MOTION, SLOW), ("tip", "m1")):
+            assert two.run(entries) == [
+                [one, "full" if one == title else ""] for one in TITLES
+            ]
             scrub(two, TS[60])
             tip = place(two, np.asarray(fj.tip_position(ARM, motion.q[60])))
-            if not side:  # else both tips have the colour
-                assert np.abs(tip_drawn(two) - tip).max() < 1
+            assert np.abs(tip_drawn(two, tip, color) - tip).max() < 1
             two.press("]")
         two.press("s")
     assert two.run("return document.getElementById('side').ariaPressed") == "false"
