@@ -301,7 +301,7 @@ MUTANTS = {
         "steps/landing.py",
         "power = jnp.where(found.resets, _RESET_PACE, _PACE)",
         "power = _PACE",
-        EVER_FASTER,
+        f"{RESETS}::test_where_a_reset_leaves_its_condition",
     ),
 }
 
