@@ -383,7 +383,7 @@ def test_circles_out_of_reach_are_refused_at_the_door(circle):
 )
 def test_what_a_task_commands_out_of_reach_is_refused_or_nan(task, words):
     arm = make("RRR")
-    place = re.escape("[9.0, 9.0] m, beyond it by ")
+    place = re.escape("[9, 9] m, beyond it by ")
     message = (
         f"^t: expected .* reach {words}.*, got 1 s, at which .* {place}[0-9.]+ m.$"
     )
