@@ -91,7 +91,9 @@ def equilibrium(
 
 
 @eqx.filter_jit
-def _rest(linkage: Linkage, forces: tuple[Element, ...], q: Array, t: Array) -> Array:
+def _rest(
+    linkage: Linkage, forces: tuple[Element, ...], q: Array | np.ndarray, t: Array
+) -> Array:
     q = without_fixed(linkage, q)
 
     def efforts(q):
@@ -124,7 +126,7 @@ def _rest(linkage: Linkage, forces: tuple[Element, ...], q: Array, t: Array) -> 
 
 @eqx.filter_jit
 def _lacking(
-    linkage: Linkage, forces: tuple[Element, ...], q: Array, t: Array
+    linkage: Linkage, forces: tuple[Element, ...], q: Array | np.ndarray, t: Array
 ) -> Array:
     """Efforts that the arm needs beside the forces to stay at rest."""
     q, still = without_fixed(linkage, q), jnp.zeros_like(q)
@@ -196,7 +198,7 @@ def linearize(
 def _linearized(
     linkage: Linkage,
     forces: tuple[Element, ...],
-    q: Array,
+    q: Array | np.ndarray,
     qd: Array,
     t: Array,
     tau: Array,
@@ -244,7 +246,11 @@ def _with_references(
 
 @eqx.filter_jit
 def loop_matrices(
-    linkage: Linkage, controller: Element, forces: tuple[Element, ...], q: Array, t: Any
+    linkage: Linkage,
+    controller: Element,
+    forces: tuple[Element, ...],
+    q: Array | np.ndarray,
+    t: Any,
 ) -> tuple[Array, Array, Array, Array]:
     """Linearises an arm under a controller about rest at `q`: A, B, C and F.
 

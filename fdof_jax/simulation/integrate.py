@@ -11,6 +11,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ..base.checks import refusal
@@ -53,7 +54,7 @@ class Inputs(NamedTuple):
 
     linkage: Linkage
     state0: Any  # a State of arrays
-    ts: Array
+    ts: Array | np.ndarray
     own0: OwnStates | None
     forces: tuple[Element, ...]
     known_ef: tuple[float, ...] | None = None
@@ -269,7 +270,7 @@ def _read(
     if tau is not None and motion.problem.args.lead is not None:
         # By a clock that is behind, rows are saved before the samples at their times.
         tau = jnp.append(tau[1:], tau[-1:], axis=0)
-    return Solution(times, q, qd, stats, result, own, *holding, tau=tau)
+    return Solution(jnp.asarray(times), q, qd, stats, result, own, *holding, tau=tau)
 
 
 def _with_end(

@@ -15,7 +15,6 @@ from ..base.checks import (
     instance,
     is_traced,
     plain,
-    real_array,
     real_numbers,
     refusal,
     shown,
@@ -224,7 +223,7 @@ def simulate(
     check_linkage(linkage)
     single_precision("linkage", linkage)
     state0 = real_state("state0", state0, linkage)
-    ts = real_array("ts", ts, (None,), of="times, for instance [0, 2.0]")
+    ts = real_numbers("ts", ts, (None,), of="times, for instance [0, 2.0]")
     increasing("ts", ts)
     keywords = solve_options(
         solver=solver,
@@ -247,7 +246,7 @@ def simulate(
         solution, succeeded = solve(inputs, keywords)
         if succeeded is None:
             # The caller's `ts` itself keeps derivatives in the times.
-            solution = eqx.tree_at(lambda s: s.ts, solution, ts)
+            solution = eqx.tree_at(lambda s: s.ts, solution, jnp.asarray(ts))
             return _raising(solution, inputs) if throw else solution
     except (TypeError, StopIteration) as error:
         check_arguments(inputs.forces)
@@ -268,8 +267,9 @@ def simulate(
             ) from error
         raise
     if throw and not succeeded:
-        check_elements(forces, linkage, ts)
-        check_start(forces, linkage, state0, ts)
+        times = jnp.asarray(ts)
+        check_elements(forces, linkage, times)
+        check_start(forces, linkage, state0, times)
         reached = float(solution.stats["time_reached"])
         why = cause(inputs, keywords, solution)
         raise RuntimeError(f"simulate: {solution.outcome} at t = {reached:g} s. {why}")

@@ -97,9 +97,10 @@ def _solve_one(inputs: Inputs, keywords: Settings) -> tuple[Solution, bool] | No
         return None
     # What has a row for each time.
     names = "q", "qd", "own", "modes", "taken", "tau"
-    rows = cut({name: vars(solution)[name] for name in names}, len(ts))
+    rows = {name: vars(solution)[name] for name in names} | {"ts": ts}
+    rows = cut(rows, len(ts))
     stats = solution.stats | {"max_steps": most}
-    solution = dataclasses.replace(solution, ts=ts, stats=stats, **rows)
+    solution = dataclasses.replace(solution, stats=stats, **rows)
     return solution, bool(succeeded)
 
 
