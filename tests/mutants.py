@@ -280,19 +280,19 @@ MUTANTS = {
     ),
     "a run ends where its last step does": Mutant(
         "steps/events.py",
-        "end, there = self._at_zero(t, y, args, which, ended & comes)",
+        "end, there = at_zero(self.term, t, y, args, which, ended & comes)",
         "end, there = t, y",
         f"{CONDITIONS}::test_a_fall_ends_on_the_floor",
     ),
     "a jump over a zero is a passage": Mutant(
         "steps/events.py",
-        "end, there = self._at_zero(t, y, args, which, ended & comes)",
-        "end, there = self._at_zero(t, y, args, which, ended)",
+        "end, there = at_zero(self.term, t, y, args, which, ended & comes)",
+        "end, there = at_zero(self.term, t, y, args, which, ended)",
         f"{CONDITIONS}"
         "::test_a_jump_that_carries_a_condition_over_its_zero_ends_the_motion_there",
     ),
     "what a reset turns round goes on": Mutant(
-        "steps/events.py",
+        "steps/conditions.py",
         "goes_on = jnp.sign(arrives) * jnp.sign(leaves) > 0",
         "goes_on = leaves < 0",
         EVER_FASTER,

@@ -16,11 +16,12 @@ from jaxtyping import PyTree
 
 from ..base.trees import constant
 from ..linkage.fields import Truth
+from .conditions import at_zero, later, met, places_of, sides_after
 from .dopri8 import SHORTEST, DenseOutput
 from .landing import Found, clearance
 from .switch_derivatives import Event, gained, gained_at_kink, lateness, moved
 from .term import Arguments, Integrated, Term
-from .zeros import CHECKED, CHECKS, OFFSET, ROUNDING, SAMPLED, SHARES, passage
+from .zeros import CHECKED, CHECKS, SAMPLED, SHARES, passage
 
 # A function whose zero is this close to the end of a step switches there: a share of
 # the step, as a power of the unit of rounding (1e-9 in float64).
@@ -28,9 +29,6 @@ _NEAR = 0.575
 # A function began on its zero if its values before were below this share of its size,
 # also a power of the unit of rounding.
 _ON_ZERO = 0.625
-# Of Newton's steps to a zero: right to rounding, with second derivatives.
-# The last of them is at most this share of all.
-_NEWTON, _CONVERGED = 3, 0.01
 # In steps of at most this many such distances, hidden zeros are not looked for.
 _BRIEF = 10
 
@@ -212,47 +210,27 @@ class Events(eqx.Module):
             there = moved(late, time, y, before, self.term)
         if self.resets:
             resets = last.resets & jumped
-            which = _places(self.resets)[jnp.argmax(resets)]
-            near = resets.any() & comes
-            at, there = self._at_zero(t, there, before, which, near)
+            which = places_of(self.resets)[jnp.argmax(resets)]
+            at, there = at_zero(
+                self.term, t, there, before, which, resets.any() & comes
+            )
         arrived_as = there, before
         own = before._replace(sides=sides)
         event = Event(last.until, at, fired, late, resets)
         there, modes = self.term.resolve(event, there, own)
         after = args._replace(sides=sides, modes=modes)
         if self.resets:
-            sides = self._sides_after(at, arrived_as, (there, after), resets, last)
+            places = places_of(self.resets)
+            own = sides_after(
+                self.term, places, at, arrived_as, (there, after), last.sizes
+            )
+            own = jnp.where(resets, own, sides[places])
+            sides = sides.at[places].set(own.astype(t.dtype))
             after = args._replace(sides=sides, modes=modes)
-            there = self._later(t - at, at, there, after)
+            there = later(self.term, t - at, at, there, after)
         if self.derivatives:
             there = moved(-late, t + late, there, after, self.term)
         return there, modes, sides, late
-
-    def _sides_after(
-        self, t: Array, before: tuple[Integrated, Arguments],
-        after: tuple[Integrated, Arguments], resets: Array, last: Switches,
-    ) -> Array:  # fmt: skip
-        """Returns the sides after resets; of a function that is 0, where it goes.
-
-        It goes on unless the reset turns its rate round, or stops it: then it is to be
-        reset again. `before`, `after`: states and arguments at the time of the reset.
-        """
-        own = _places(self.resets)
-
-        def at(state: tuple[Integrated, Arguments]) -> tuple[Array, Array]:
-            y, args = state
-            function = lambda t, y: self.term.switches(t, y, args)[0][own]
-            along = jnp.ones_like(t), self.term.vf(t, y, args)
-            return constant(jax.jvp(function, (t, y), along))
-
-        (_, arrives), (values, leaves) = at(before), at(after)
-        eps, sizes, sides = jnp.finfo(t.dtype).eps, last.sizes[own], after[1].sides
-        # As near as steps end to zeros.
-        on_zero = jnp.abs(values) <= 2 * (eps**OFFSET * sizes + ROUNDING * eps)
-        goes_on = jnp.sign(arrives) * jnp.sign(leaves) > 0
-        there = jnp.where(goes_on, -last.sides[own], last.sides[own])
-        side = jnp.where(on_zero, there, jnp.where(values > 0, 1.0, -1.0))
-        return sides.at[own].set(jnp.where(resets, side, sides[own]).astype(t.dtype))
 
     def _shifted(
         self, t: Array, y: Integrated, args: Arguments, last: Switches, jumped: Truth
@@ -324,7 +302,7 @@ class Events(eqx.Module):
         passed_zero = passed.switched & ~on_zero
         resets = None
         if self.resets:
-            resets = _met(self.resets, passed_zero, after)
+            resets = met(self.resets, passed_zero, after)
         found = Found(
             until=until,
             unseen=jnp.where(passed.unseen < 1, t0 + passed.unseen * h, t1),
@@ -359,8 +337,8 @@ class Events(eqx.Module):
         """
         if not self.ends:
             return None
-        met = _met(self.ends, passed, after)
-        return jnp.where(met.any(), jnp.argmax(met), -1)
+        ends = met(self.ends, passed, after)
+        return jnp.where(ends.any(), jnp.argmax(ends), -1)
 
     def at_end(
         self, t: Array, y: Integrated, args: Arguments, last: Switches
@@ -373,42 +351,13 @@ class Events(eqx.Module):
         args = args._replace(sides=last.sides, modes=last.modes)
         assert last.ended is not None
         ended, comes = last.ended >= 0, last.length > 0
-        which = _places(self.ends)[last.ended]
-        end, there = self._at_zero(t, y, args, which, ended & comes)
+        which = places_of(self.ends)[last.ended]
+        end, there = at_zero(self.term, t, y, args, which, ended & comes)
         if last.late is None:
             return end, there
         # A jump carried it over its zero: at the time of that event.
         late = jnp.where(ended & ~comes, last.late, 0)
         return end + late, moved(late, end, there, args, self.term)
-
-    def _at_zero(
-        self, t: Array, y: Integrated, args: Arguments, which: Array, near: Array
-    ) -> tuple[Array, Integrated]:
-        """Returns time and state at the zero of a function, if the state is near it.
-
-        Else those given, also if there is none, as of what turns back close to it. By
-        Newton's method, to rounding and to second derivatives.
-        """
-        later = lambda time: self._later(time, t, y, args)
-
-        def function(time):
-            return self.term.switches(t + time, later(time), args)[0][which]
-
-        time = change = jnp.zeros_like(t)
-        for _ in range(_NEWTON):
-            value, slope = jax.jvp(function, (time,), (jnp.ones_like(t),))
-            steep = near & (slope != 0)
-            change = jnp.where(steep, value / jnp.where(steep, slope, 1), 0)
-            time = time - change
-        time = jnp.where(jnp.abs(change) <= _CONVERGED * jnp.abs(time), time, 0)
-        return t + time, later(time)
-
-    def _later(
-        self, time: Array, t: Array, y: Integrated, args: Arguments
-    ) -> Integrated:
-        """Returns the state a short time later, by the midpoint rule."""
-        middle = _along(y, time / 2, self.term.vf(t, y, args))
-        return _along(y, time, self.term.vf(t + time / 2, middle, args))
 
     def _one_sided(
         self, last: Switches, on_zero: Array, regime: Regime, sizes: Array
@@ -422,24 +371,6 @@ class Events(eqx.Module):
         several = jnp.sum(regime.changed & jumping) > 1
         together = several & (last.grazing_here > 0)
         return jnp.maximum(last.one_sided, at_once) + together
-
-
-def _places(conditions: tuple[tuple[int, int], ...]) -> Array:
-    return jnp.array([place for place, _ in conditions])
-
-
-def _met(conditions: tuple[tuple[int, int], ...], passed: Array, after: Array) -> Array:
-    """Returns which conditions are met, (condition,).
-
-    `passed`: which functions passed a zero; `after`: all sides then.
-    """
-    places = _places(conditions)
-    wanted = jnp.array([direction for _, direction in conditions])
-    return passed[places] & ((wanted == 0) | (wanted == after[places]))
-
-
-def _along(y: Integrated, time: Array, rates: Integrated) -> Integrated:
-    return jax.tree.map(lambda a, rate: a + time * rate, y, rates)
 
 
 def events_of(
