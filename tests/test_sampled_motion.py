@@ -1,5 +1,7 @@
 """A motion under sampled control in pictures, tables and a line of text."""
 
+from functools import partial
+
 import diffrax
 import numpy as np
 import pytest
@@ -67,3 +69,11 @@ def test_tables_take_it():
 def test_it_is_told_in_a_line():
     expected = "Solution(motions: 1; times: 5, 0 to 2 s; outcome: successful)"
     assert repr(disc_motion()) == expected
+
+
+def test_a_solve_that_fails_raises_an_error_unless_told_otherwise():
+    start, sample = fj.State([0.0], [0.0]), partial(fj.simulate_sampled, DISC)
+    with pytest.raises(RuntimeError, match="out of steps"):
+        sample(start, fj.JointEffort([1.0]), 0.5, 4, max_steps=3)
+    motion = sample(start, fj.JointEffort([1.0]), 0.5, 4, max_steps=3, throw=False)
+    assert motion.outcome == "out of steps"

@@ -145,7 +145,8 @@ def simulate_sampled(
     `(control, *forces)`, the controller first. The controller's efforts are then those
     that act: 0 before the first command arrives.
 
-    **Raises:** ValueError for malformed arguments.
+    **Raises:** ValueError for malformed arguments; RuntimeError for a failed solve,
+    unless `throw=False`.
 
     >>> import fdof_jax as fj
     >>> arm, start, (pd,), _ = fj.scenes.fig7()
@@ -187,7 +188,7 @@ def simulate_sampled(
         within = rest > clearance(times)
         arrivals = (Arrivals(clock._replace(first=t0 + rest)),)
     sampler = Sampler(clock, control, added, rest, late.whole, late.most)
-    options = dict(throw=False, max_steps=65536 + 64 * samples) | options
+    options = dict(max_steps=65536 + 64 * samples) | options
     acting = *forces, *arrivals, sampler
     motion = simulate(linkage, state0, times, acting, **options)
     assert motion.tau is not None
