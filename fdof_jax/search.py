@@ -20,11 +20,12 @@ from numpy.typing import ArrayLike
 from .base.checks import function, instance, whole_number
 from .base.configuration import options_of_loops
 from .base.functions import sharing_functions
+from .batches.stacks import stacked
 from .forces.element import elements
 from .linkage.coordinates import real_state
 from .linkage.linkage import check_linkage
 from .simulation.jacobian import Sensitivities
-from .simulation.scene import Scene, stacked
+from .simulation.scene import Scene
 from .simulation.simulate import elements_at_door, simulate
 
 # Greatest change of an unknown in a step: a factor of 7 if unknowns are logarithms.

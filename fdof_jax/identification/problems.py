@@ -12,10 +12,11 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..base.checks import function, instance, real_array, refusal, shown
+from ..batches.stacks import stacked
 from ..mechanics.kinematics import joint_positions, tip_position
 from ..search import Evaluation, check_scene, sum_of_squares
 from ..simulation.jacobian import jacobian_of
-from ..simulation.scene import Scene, stacked
+from ..simulation.scene import Scene
 from ..simulation.solution import Solution, check_joints
 
 Named = dict[str, Any]  # parameters by name, as numbers or arrays

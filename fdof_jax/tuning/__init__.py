@@ -1,6 +1,6 @@
 """Gain tuning by gradients."""
 
-from ..simulation.scene import stacked
+from ..batches.stacks import stacked
 from .losses import Tracking, joint_errors, tip_errors
 from .result import TuneResult
 from .tuning import tune

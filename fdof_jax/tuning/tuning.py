@@ -7,10 +7,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..base.checks import one_of, refusal, whole_number
+from ..batches.stacks import unstacked
 from ..linkage.linkage import joint_names
 from ..search import METHODS, Lanes, Row, Run, best_of, check_motion, minimise
 from ..simulation.jacobian import TOLERANCE
-from ..simulation.scene import Scene, unstacked, with_full_size
+from ..simulation.scene import Scene, with_full_size
 from .losses import (
     SAMPLES,
     Loss,
