@@ -21,7 +21,8 @@ Units are SI. `help(fj.simulate)` documents a name; submodules hold more names.
   in `identification`: fit, FitResult.
 - **Pictures**: view, drawing, plotting. **Files and tables**, more in `data`: save,
   load, to_pandas, to_xarray, to_mjcf, from_mjcf.
-- **The paper's figures**: scenes.
+- **The paper's figures**: scenes. **For code of your own**: `fdof_jax.checks` of
+  arguments, and questions about an arm in `fdof_jax.linkage`.
 """
 
 import importlib
@@ -29,9 +30,11 @@ from typing import TYPE_CHECKING
 
 from . import (
     analysis,
+    checks as checks,
     control,
     forces,
     identification,
+    linkage as linkage,
     paper,
     references,
     scenes,

@@ -119,7 +119,14 @@ class Drive(StatefulElement):
 def controller_in(element: object) -> PDController | None:
     """Returns the controller that an element is, or holds as its command, if any.
 
-    Of a `PIDController` that is its PD part, which has the reference and the limits.
+    Of a `PIDController` that is its PD part, which has the reference and the limits
+    [N or N m].
+
+    >>> import fdof_jax as fj
+    >>> pid = fj.control.PIDController(100, 50, 10, 30, fj.CircleTask())
+    >>> lag = fj.control.FirstOrderLag(pid, time_constant=0.1)
+    >>> fj.control.controller_in(lag) is pid.pd, fj.control.controller_in(len)
+    (True, None)
     """
     while isinstance(element, Drive):
         element = element.command

@@ -11,7 +11,7 @@ from jax import Array
 from ..base.checks import refusal
 from ..linkage.linkage import Linkage
 from ..mechanics.equations import Upper
-from .element import Element, Forces, InertialElement, elements_on
+from .element import Element, Forces, InertialElement, elements, elements_on
 
 _ANY = np.zeros(())  # a time: masses that never change are the same at all
 
@@ -22,8 +22,23 @@ def inertial(forces: Forces) -> tuple[InertialElement, ...]:
 
 
 def present(forces: Forces, t: Array) -> Forces:
-    """Returns the elements as they are at a time."""
-    return tuple(e.at(t) if isinstance(e, InertialElement) else e for e in forces)
+    """Returns the elements as they are at a time, for functions without a time.
+
+    **Arguments:** `forces`: a tuple of elements; `t`: time [s].
+
+    **Raises:** ValueError if `forces` is not a tuple of force elements.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.double_pendulum().linkage
+    >>> load = fj.forces.Payload(fj.Point(2, 1.0), mass=2.0, begin=0.5)
+    >>> for t in 0.0, 1.0:  # [s]
+    ...     now = fj.forces.present((load,), t)
+    ...     print(fj.mass_matrix(arm, [0, 0], now)[1, 1].item())  # [kg m^2]
+    0.333
+    2.333
+    """
+    found = elements("forces", forces)
+    return tuple(e.at(t) if isinstance(e, InertialElement) else e for e in found)
 
 
 def _without_times(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
