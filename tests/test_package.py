@@ -15,7 +15,7 @@ from mutants import MUTANTS
 import fdof_jax as fj
 
 # Folders that import from public rooms alone, as a user does: see test_leaves.py.
-LEAVES = "mjcf", "pictures", "viewer"
+LEAVES = "mjcf", "pictures", "servo", "viewer"
 FOLDER = Path(fj.__file__).parent
 ROOT = Path(__file__).parents[1]
 

@@ -214,13 +214,10 @@ def real_array(
     """Returns `value` as an array of JAX, of the default float dtype and a shape.
 
     **Arguments:** `name`: of the argument, for messages; `shape`: `None` in it stands
-    for any length. Further rules are keywords:
-
-    - `minimum`, `above`: lower bounds, inclusive and exclusive; `finite=False` accepts
-      infinities.
-    - `broadcast=True` accepts one number for all entries, and repeats it.
-    - `unit`, for instance "m", and `of`, what the numbers are of: for messages. Known
-      numbers in "rad" that look like degrees bring a warning.
+    for any length; `minimum`, `above`: lower bounds, inclusive and exclusive;
+    `finite=False` accepts infinities; `broadcast=True` accepts one number for all
+    entries, and repeats it; `unit`, for instance "m", and `of`, what the numbers are
+    of, are for messages. Known angles in "rad" that look like degrees bring a warning.
 
     **Raises:** ValueError for a wrong shape, a type that is not real numbers, NaN, and
     numbers out of bounds; of traced numbers, only the shape and the type are checked.

@@ -121,12 +121,6 @@ def controller_in(element: object) -> PDController | None:
 
     Of a `PIDController` that is its PD part, which has the reference and the limits
     [N or N m].
-
-    >>> import fdof_jax as fj
-    >>> pid = fj.control.PIDController(100, 50, 10, 30, fj.CircleTask())
-    >>> lag = fj.control.FirstOrderLag(pid, time_constant=0.1)
-    >>> fj.control.controller_in(lag) is pid.pd, fj.control.controller_in(len)
-    (True, None)
     """
     while isinstance(element, Drive):
         element = element.command

@@ -27,15 +27,6 @@ def present(forces: Forces, t: Array) -> Forces:
     **Arguments:** `forces`: a tuple of elements; `t`: time [s].
 
     **Raises:** ValueError if `forces` is not a tuple of force elements.
-
-    >>> import fdof_jax as fj
-    >>> arm = fj.scenes.double_pendulum().linkage
-    >>> load = fj.forces.Payload(fj.Point(2, 1.0), mass=2.0, begin=0.5)
-    >>> for t in 0.0, 1.0:  # [s]
-    ...     now = fj.forces.present((load,), t)
-    ...     print(fj.mass_matrix(arm, [0, 0], now)[1, 1].item())  # [kg m^2]
-    0.333
-    2.333
     """
     found = elements("forces", forces)
     return tuple(e.at(t) if isinstance(e, InertialElement) else e for e in found)

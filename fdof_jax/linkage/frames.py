@@ -89,16 +89,9 @@ def link_frames(linkage: Linkage, q: ArrayLike) -> Frames:
 
     **Arguments:** `linkage`; `q`: joint positions (time, n) [m or rad].
 
-    **Returns:** `Frames` in NumPy, whose arrays but `revolute` begin with an axis of
-    times.
+    **Returns:** `Frames` in NumPy, with an axis of times before the others.
 
     **Raises:** ValueError for malformed arguments and within JAX's transformations.
-
-    >>> import fdof_jax as fj
-    >>> arm = fj.scenes.double_pendulum().linkage
-    >>> found = fj.linkage.link_frames(arm, [[0, 0], [1.5707963, 0]])
-    >>> found.tip(arm).round(3).tolist(), found.angle[:, 2].round(3).tolist()
-    ([(2+0j), 2j], [0.0, 1.571])
     """
     check_linkage(linkage)
     check_known("q", linkage, q)

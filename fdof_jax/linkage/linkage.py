@@ -137,10 +137,6 @@ def joint_names(linkage: Linkage) -> list[str]:
     """Returns the names of the joints in order, for instance R1, P2, F3.
 
     **Raises:** ValueError if `linkage` is not a linkage.
-
-    >>> import fdof_jax as fj
-    >>> fj.linkage.joint_names(fj.scenes.cart_pole().linkage)
-    ['P1', 'R2']
     """
     instance("linkage", linkage, Linkage)
     return [f"{kind}{k + 1}" for k, kind in enumerate(linkage.topology)]
@@ -150,12 +146,6 @@ def moving_joints(linkage: Linkage) -> list[int]:
     """Returns the indices, from 0, of the joints that are not fixed.
 
     **Raises:** ValueError if `linkage` is not a linkage.
-
-    >>> import fdof_jax as fj
-    >>> shorter = fj.Linkage("RFR", length=[0, 1, 0, 1], com=[[0, 0]] * 3,
-    ...                      mass=[1, 0, 1], inertia=[1, 0, 1])
-    >>> fj.linkage.moving_joints(shorter)
-    [0, 2]
     """
     instance("linkage", linkage, Linkage)
     return [k for k, kind in enumerate(linkage.topology) if kind != "F"]
@@ -173,11 +163,6 @@ def per_joint(name: str, values: ArrayLike, linkage: Linkage) -> Array:
     positions [m or rad]; known ones named "q" that look like degrees bring a warning.
 
     **Raises:** ValueError for all but n finite real numbers.
-
-    >>> import fdof_jax as fj
-    >>> arm = fj.scenes.double_pendulum().linkage
-    >>> fj.checks.per_joint("q", [0, 1], arm).tolist()
-    [0.0, 1.0]
     """
     instance("linkage", linkage, Linkage)
     n = joints_of(linkage)

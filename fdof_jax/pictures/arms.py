@@ -1,6 +1,6 @@
 """An arm in pictures: where its parts are, and their lines and markers."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -48,10 +48,7 @@ class Geometry(NamedTuple):
 
 
 def geometry(
-    linkage: Linkage,
-    q: ArrayLike,
-    ts: ArrayLike | None = None,
-    forces: tuple[Any, ...] = (),
+    linkage: Linkage, q: ArrayLike, ts: ArrayLike | None = None, forces: tuple = ()
 ) -> Geometry:
     """Computes the points of a linkage's parts along a motion, for other renderers.
 

@@ -78,7 +78,7 @@ def draw_linkage(
     q: ArrayLike,
     ax: Axes | None = None,
     *,
-    forces: tuple[Any, ...] = (),
+    forces: tuple = (),
     color: ColorType | None = None,
     alpha: float = 1.0,
     mass_centers: bool = True,
@@ -199,7 +199,7 @@ def topology_grid(
     motions: Mapping[str, tuple[Linkage, Solution]],
     fig: Figure | None = None,
     *,
-    forces: Mapping[str, tuple[Any, ...]] | None = None,
+    forces: Mapping[str, tuple] | None = None,
     configurations: int = 3,
 ) -> Figure:
     """Draws linkages side by side, each with a few configurations and its tip's path.
@@ -223,7 +223,7 @@ def animate(
     solution: Solution,
     ax: Axes | None = None,
     *,
-    forces: tuple[Any, ...] = (),
+    forces: tuple = (),
     until: float | None = None,
     fps: float = 25,
     speed: float = 1.0,
@@ -256,7 +256,7 @@ def animate_grid(
     motions: Mapping[str, tuple[Linkage, Solution]],
     fig: Figure | None = None,
     *,
-    forces: Mapping[str, tuple[Any, ...]] | None = None,
+    forces: Mapping[str, tuple] | None = None,
     fps: float = 25,
     speed: float = 1.0,
     max_frames: int = 250,
@@ -277,8 +277,7 @@ def animate_grid(
 
 
 def _geometries(
-    motions: Mapping[str, tuple[Linkage, Solution]],
-    forces: Mapping[str, tuple[Any, ...]] | None,
+    motions: Mapping[str, tuple[Linkage, Solution]], forces: Mapping[str, tuple] | None
 ) -> dict[str, tuple[np.ndarray, Geometry]]:
     """Times and geometry of each motion, with its force elements, by title."""
     filled_mapping("motions", motions, "(Linkage, Solution)")

@@ -1,7 +1,5 @@
 """Force elements in pictures: each is one line through the points of its symbol."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,7 +28,7 @@ ELEMENT_STYLES: dict[str, Keywords] = {
 
 
 def element_lines(
-    linkage: Linkage, forces: tuple[Any, ...], f: Frames, ts: np.ndarray, size: float
+    linkage: Linkage, forces: tuple, f: Frames, ts: np.ndarray, size: float
 ) -> dict[str, np.ndarray]:
     """Lines (time, points) of the elements that have a place, as x + iy [m].
 

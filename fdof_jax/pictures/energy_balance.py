@@ -1,7 +1,5 @@
 """The energy balance of a motion: what there is, and what elements put in and take."""
 
-from typing import Any
-
 import jax
 import numpy as np
 
@@ -18,7 +16,7 @@ from .axes import reached
 
 
 def energy_balance(
-    linkage: Linkage, forces: tuple[Any, ...], solution: Solution
+    linkage: Linkage, forces: tuple, solution: Solution
 ) -> tuple[np.ndarray, dict[str, np.ndarray], np.ndarray]:
     """Returns times, energies by name, and what was there and put in, their sum [J].
 

@@ -7,7 +7,6 @@ pictures of the linkage itself.
 
 from inspect import isfunction
 from itertools import cycle
-from typing import Any
 
 import jax
 import numpy as np
@@ -58,7 +57,7 @@ def motion_profile(
     solution: Solution,
     fig: Figure | None = None,
     *,
-    forces: tuple[Any, ...] = (),
+    forces: tuple = (),
     absolute: bool = False,
     title: str | None = None,
 ) -> Figure:
@@ -119,7 +118,7 @@ def motion_profile(
 
 
 def _references(
-    linkage: Linkage, forces: tuple[Any, ...], ts: np.ndarray
+    linkage: Linkage, forces: tuple, ts: np.ndarray
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Returns times and positions (time, n) of the references of all controllers.
 
@@ -160,10 +159,7 @@ def energy_profile(
 
 
 def energy_stack(
-    linkage: Linkage,
-    forces: tuple[Any, ...],
-    solution: Solution,
-    ax: Axes | None = None,
+    linkage: Linkage, forces: tuple, solution: Solution, ax: Axes | None = None
 ) -> Axes:
     """Plots the energy balance over time, stacked [J].
 
@@ -198,10 +194,7 @@ def energy_stack(
 
 
 def effort_profile(
-    linkage: Linkage,
-    forces: tuple[Any, ...],
-    solution: Solution,
-    fig: Figure | None = None,
+    linkage: Linkage, forces: tuple, solution: Solution, fig: Figure | None = None
 ) -> Figure:
     """Plots the efforts of each element over time, a panel per joint [N or N m].
 
@@ -265,7 +258,7 @@ def effort_profile(
     return fig
 
 
-def _names(forces: tuple[Any, ...]) -> list[str]:
+def _names(forces: tuple) -> list[str]:
     """Returns the names of the elements' classes, of plain functions their own."""
     return [f.__name__ if isfunction(f) else type(f).__name__ for f in forces]
 
