@@ -21,25 +21,24 @@ Units are SI. `help(fj.simulate)` documents a name; submodules hold more names.
   in `identification`: fit, FitResult.
 - **Pictures**: view, drawing, plotting. **Files and tables**, more in `data`: save,
   load, to_pandas, to_xarray, to_mjcf, from_mjcf.
-- **The paper's figures**: scenes.
+- **The paper's figures**: scenes. **For code of your own**: `fdof_jax.checks` of
+  arguments, and questions about an arm in `fdof_jax.linkage`.
 """
 
 import importlib
 from typing import TYPE_CHECKING
 
 from . import (
-    analysis,
+    checks as checks,
     control,
     forces,
     identification,
+    linkage as linkage,
     paper,
     references,
     scenes,
     simulation,
-    tuning,
 )
-from .analysis.linearization import linearize
-from .analysis.reactions import joint_reactions
 from .base.configuration import configure
 from .base.version import __version__ as __version__
 from .batches.sweep import sweep
@@ -75,16 +74,16 @@ from .simulation.sampled import simulate_sampled, step
 from .simulation.scene import Scene
 from .simulation.simulate import simulate
 from .simulation.solution import Solution
-from .tuning.result import TuneResult
-from .tuning.tuning import tune
 
 if TYPE_CHECKING:
     from .pictures import drawing, plotting
     from .viewer.view import view
 
-# Last, as `mjcf` imports names from above.
-from . import data
+# Last, as leaves import names from above.
+from . import analysis, data, tuning
+from .analysis import joint_reactions, linearize
 from .data import from_mjcf, load, save, to_mjcf, to_pandas, to_xarray
+from .tuning import TuneResult, tune
 
 __all__ = [
     "analysis", "bias_force", "CircleTask", "configure", "control", "data", "drawing",

@@ -8,12 +8,11 @@ import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 
-from . import scenes
+from . import drawing, plotting, scenes
 from .base.configuration import configure
 from .base.version import __version__
 from .base.whole_files import folder_path
 from .forces.joints import JointDamper
-from .pictures import drawing, plotting
 from .simulation.scene import Scene
 from .simulation.simulate import simulate
 from .simulation.solution import Solution

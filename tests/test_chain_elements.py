@@ -15,7 +15,7 @@ import pytest
 from elements import SHORT
 
 import fdof_jax as fj
-from fdof_jax.analysis.measures import relative_demands
+from fdof_jax.tuning.losses import relative_demands
 
 pytestmark = pytest.mark.slow
 ARM, VALUES = elements.arm("RPR"), {n: np.asarray(v) for n, v in elements.ARM.items()}

@@ -10,8 +10,7 @@ from elements import MOVE, arm as small_arm
 from helpers import random_linkage
 
 import fdof_jax as fj
-from fdof_jax.analysis.measures import relative_demands
-from fdof_jax.tuning.losses import tip_deviation, with_gains
+from fdof_jax.tuning.losses import relative_demands, tip_deviation, with_gains
 
 each_topology = pytest.mark.parametrize("topology", fj.TOPOLOGIES)
 FREE = (8.0, 5.0, jnp.inf, MOVE)  # gains, limit and reference

@@ -23,7 +23,9 @@ PUBLIC = {
 UNITLESS = {
     "existence_factors", "to_mjcf", "fig3", "fig5", "fig7", "load", "save", "stacked",
     "circle_scenes", "configure", "Condition", "Values", "field", "accepts_scene",
-    "of_kind",
+    "of_kind", "check_joints", "check_known", "check_linkage", "instance",
+    "joint_names", "moving_joints", "one_of", "plain", "real_array", "refusal",
+    "Report", "shown", "whole_number",
 }  # fmt: skip
 # Names that implement something printed in the paper.
 SOURCES = {
@@ -84,6 +86,7 @@ NAMES = [
 RETURNED_BY = {
     "FitResult": "fit",
     "Efforts": "joint_efforts",
+    "Frames": "link_frames",
     "Linearization": "linearize",
     "MjcfModel": "from_mjcf",
     "Margins": "margins",

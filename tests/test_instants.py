@@ -31,6 +31,7 @@ FREE = {
         BAR, forces, MOTION
     ),
     analysis.open_loop: lambda forces: analysis.open_loop(BAR, Q, PD, 1, forces),
+    analysis.loop_matrices: lambda forces: analysis.loop_matrices(BAR, Q, PD, forces),
     analysis.closed_loop: lambda forces: analysis.closed_loop(BAR, Q, PD, 1, forces),
 }
 # These are given no time: they refuse masses that depend on it. What holds joints has
@@ -46,13 +47,14 @@ TIMELESS = {
         BAR, Q, 5.0, 0.7, forces
     ),
 }
-# These compute a motion or take one with its times, draw, or write.
+# These compute a motion, take one or a time, draw, or write.
 OTHERS = {
     fj.simulate, fj.simulate_sampled, fj.step, fj.sweep, fj.joint_efforts,
     fj.joint_reactions, analysis.response, plotting.effort_profile,
     plotting.energy_stack, plotting.motion_profile, drawing.animate,
     drawing.animate_grid, drawing.draw_linkage, drawing.geometry,
     drawing.topology_grid, fj.to_mjcf, fj.view, fj.forces.elements_on,
+    fj.forces.present,
 }  # fmt: skip
 
 

@@ -370,3 +370,21 @@ def test_tasks_without_orientation_are_followed_at_their_exact_rates(topology):
     motion = fj.simulate(chain, start, TS, (pd,), **SHORT)
     for t, q in zip(motion.ts, motion.q):
         np.testing.assert_allclose(fj.tip_position(chain, q), task.tip(t), atol=1e-4)
+
+
+def test_frames_of_links_lead_to_the_tip():
+    rng = np.random.default_rng(1)
+    arm, q = random_linkage("RPR", rng), rng.uniform(-1, 1, (3, 3))
+    found = fj.linkage.link_frames(arm, q)
+    tips = jax.vmap(fj.tip_position, (None, 0))(arm, q) @ np.array([1, 1j])
+    np.testing.assert_allclose(found.tip(arm), tips, atol=1e-12)
+    with pytest.raises(ValueError, match="^q: expected an array of nx3 real numbers"):
+        fj.linkage.link_frames(arm, q[0])
+    with pytest.raises(ValueError, match="^q: expected known values"):
+        jax.jit(lambda q: fj.linkage.link_frames(arm, q).angle)(q)
+
+
+def test_questions_about_an_arm_name_what_is_none():
+    for ask in fj.linkage.joint_names, fj.linkage.moving_joints:
+        with pytest.raises(ValueError, match="^linkage: expected a Linkage, got"):
+            ask("RPR")

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
-from fdof_jax.analysis.measures import step_measures
+from fdof_jax.analysis import step_measures
 from fdof_jax.references import Ramp, Step
 
 SLIDE = fj.Linkage("P", mass=[1], com=[[0, 0]], inertia=[1], length=[0, 1], gravity=0)
@@ -170,3 +170,7 @@ def test_what_is_refused():
     stopped = fj.simulate(SLIDE, START, TS, forces, max_steps=3, throw=False)
     with pytest.raises(ValueError, match="solution: .* reached its end, got .out of"):
         response(SLIDE, (PD,), stopped)
+    with pytest.raises(ValueError, match="ts: expected two or more increasing"):
+        step_measures([0.0, 0.0], [0.0, 1.0], [0.0, 0.0], 1.0)
+    with pytest.raises(ValueError, match=r"rate: expected real .* shape \(2,\)"):
+        step_measures([0.0, 1.0], [0.0, 1.0], [0.0], 1.0)

@@ -15,14 +15,14 @@ from mutants import MUTANTS
 import fdof_jax as fj
 
 # Folders that import from public rooms alone, as a user does: see test_leaves.py.
-LEAVES = "mjcf", "viewer"
+LEAVES = "mjcf", "pictures", "servo", "viewer"
 FOLDER = Path(fj.__file__).parent
 ROOT = Path(__file__).parents[1]
 
 
 NAMESPACES = [
-    fj, fj.analysis, fj.control, fj.data, fj.forces, fj.identification, fj.paper,
-    fj.references, fj.simulation, fj.tuning,
+    fj, fj.analysis, fj.checks, fj.control, fj.data, fj.forces, fj.identification,
+    fj.linkage, fj.paper, fj.references, fj.simulation, fj.tuning,
 ]  # fmt: skip
 
 
@@ -70,7 +70,7 @@ ROOMS = {
     "base": 0, "linkage": 1, "paper": 2, "mechanics": 2, "forces": 3, "dynamics": 4,
     "references": 4, "control": 5, "steps": 6, "simulation": 7, "batches": 8,
     "analysis": 8, "search": 9, "tuning": 10, "identification": 10, "scenes": 11,
-    "pictures": 12, "data": 12, "__main__": 14, "__init__": 13,
+    "checks": 12, "data": 12, "drawing": 12, "__main__": 14, "__init__": 13,
 }  # fmt: skip
 
 

@@ -17,8 +17,8 @@ import fdof_jax as fj
 from fdof_jax import search
 
 ROOMS = (
-    fj, fj.analysis, fj.control, fj.data, fj.forces, fj.identification, fj.references,
-    fj.tuning,
+    fj, fj.analysis, fj.control, fj.data, fj.forces, fj.identification, fj.linkage,
+    fj.references, fj.tuning,
 )  # fmt: skip
 # JAX raises the last one for integers that no array holds.
 MEANT = ValueError, TypeError, ImportError, RuntimeError, OverflowError

@@ -9,10 +9,10 @@ import pytest
 
 import fdof_jax as fj
 from fdof_jax import scenes, search
-from fdof_jax.analysis.measures import demands
 from fdof_jax.tuning.losses import (
     bounds_of,
     controller_of,
+    demands,
     gains_of,
     tip_errors,
     with_controller,

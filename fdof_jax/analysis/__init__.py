@@ -8,16 +8,20 @@ from .linearization import (
     equilibrium,
     holding_efforts,
     linearize,
+    loop_matrices,
 )
-from .loops import Margins, bandwidth, closed_loop, margins, open_loop
-from .measures import Response, response
 from .reactions import inertial_parameters, joint_reactions, regressor
+
+# isort: split
+# Last, as `servo` imports names from above.
+from ..servo.loops import Margins, bandwidth, closed_loop, margins, open_loop
+from ..servo.measures import Response, response, step_measures
 
 __all__ = [
     "bandwidth", "closed_loop", "closed_loop_modes", "equilibrium", "holding_efforts",
     "inertia_ratios", "inertial_parameters", "joint_reactions", "Linearization",
-    "linearize", "Margins", "margins", "Modes", "open_loop", "regressor", "Response",
-    "response",
+    "linearize", "loop_matrices", "Margins", "margins", "Modes", "open_loop",
+    "regressor", "Response", "response", "step_measures",
 ]  # fmt: skip
 
 

@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
-from ..base.checks import check_known, instance, real_array, refusal
+from ..base.checks import check_known, function, instance, real_array, refusal
 from ..control.pd import PDController
 from ..dynamics import bias_force, forward_dynamics
 from ..forces.added_inertia import present
@@ -244,21 +244,42 @@ def _with_references(
     return jax.tree.map(of, element, is_leaf=whole)
 
 
-@eqx.filter_jit
 def loop_matrices(
+    linkage: Linkage,
+    q: ArrayLike,
+    controller: Callable,
+    forces: Forces = (),
+    t: ArrayLike = 0.0,
+) -> tuple[Array, Array, Array, Array]:
+    """Linearises an arm under a controller about rest at `q`, as matrices.
+
+    **Arguments:** as in `open_loop`, which makes a system of them.
+
+    **Returns:** A, B, C and F (3, state, n). The state y is (q, qd, the controller's
+    own): dy/dt = A y + B tau with efforts tau added to the controller's, which are -C y
+    [N or N m]. Constant efforts hold the arm at rest. Changes of the reference's
+    positions, velocities and accelerations at the time add F times these to dy/dt.
+
+    **Raises:** ValueError for malformed arguments.
+    """
+    forces = checked(linkage, forces)
+    function("controller", controller, "a force element, a PDController for instance")
+    (element,) = elements_on(linkage, (controller,))
+    check_free("controller", element)
+    if prescribed((element,)) is not None:
+        raise refusal("controller", "one that computes efforts", controller)
+    q, t = per_joint("q", q, linkage), real_array("t", t, ())
+    return _loop_matrices(linkage, element, forces, q, t)
+
+
+@eqx.filter_jit
+def _loop_matrices(
     linkage: Linkage,
     controller: Element,
     forces: tuple[Element, ...],
     q: Array | np.ndarray,
     t: Any,
 ) -> tuple[Array, Array, Array, Array]:
-    """Linearises an arm under a controller about rest at `q`: A, B, C and F.
-
-    The state y is (q, qd, the controller's own): dy/dt = A y + B tau with efforts tau
-    added to the controller's, which are -C y. Constant efforts hold the arm at rest.
-    Changes of the reference's positions, velocities and accelerations at the time add
-    F (3, state, n) to dy/dt.
-    """
     own, rebuilt = ravel_pytree(controller.initial_state(linkage))
     n, still = q.size, jnp.zeros_like(q)
     hold = _lacking(linkage, forces, q, t)

@@ -132,16 +132,11 @@ def real_numbers(
     unit: str = "",
     of: str = "",
 ) -> Array | np.ndarray:
-    """Returns `value` as an array of the default float dtype and the given shape.
+    """Returns numbers as `real_array` does, but in NumPy, none that the caller has.
 
-    It is an array of NumPy, none that the caller has; or of JAX, if `value` is traced
-    or is an array of JAX of that dtype and shape already.
-    `None` in `shape` stands for any length, and JOINT for that of any arm. `broadcast`
-    also accepts one number for all entries, and repeats it if the shape is known;
-    `rows` also accepts so many rows of that shape.
-    Raises ValueError for a wrong shape, a type that is not real numbers, NaN,
-    infinities (unless `finite=False`) and entries below `minimum` or not above `above`;
-    the message names the `unit`, and what the numbers are `of`.
+    They are in JAX if `value` is traced or is an array of JAX of that dtype and shape
+    already. JOINT in `shape` stands for the length of any arm. `rows` also accepts so
+    many rows of that shape.
     """
 
     def refuse(got: str) -> ValueError:
@@ -216,7 +211,17 @@ def within_bounds(
 def real_array(
     name: str, value: object, shape: tuple[int | str | None, ...], **rules: Any
 ) -> Array:
-    """Returns the `real_numbers` as an array of JAX."""
+    """Returns `value` as an array of JAX, of the default float dtype and a shape.
+
+    **Arguments:** `name`: of the argument, for messages; `shape`: `None` in it stands
+    for any length; `minimum`, `above`: lower bounds, inclusive and exclusive;
+    `finite=False` accepts infinities; `broadcast=True` accepts one number for all
+    entries, and repeats it; `unit`, for instance "m", and `of`, what the numbers are
+    of, are for messages. Known angles in "rad" that look like degrees bring a warning.
+
+    **Raises:** ValueError for a wrong shape, a type that is not real numbers, NaN, and
+    numbers out of bounds; of traced numbers, only the shape and the type are checked.
+    """
     numbers = real_numbers(name, value, shape, **rules)
     if isinstance(numbers, Array):
         return numbers

@@ -12,8 +12,9 @@ Rows = Sequence[Sequence[str]]
 class Report(eqx.Module):
     """A result that prints itself: a verdict, a table, and remarks.
 
-    The first row of a table is its header. Columns without one hold words; an empty
-    header is left out.
+    A notebook shows it as HTML. A subclass implements what it has of `_verdict`,
+    `_rows` and `_remarks`. The first row of a table is its header. Columns without one
+    hold words; an empty header is left out.
     """
 
     def _verdict(self) -> list[str]:

@@ -1,13 +1,13 @@
 """Controllers, feedforward and drives."""
 
 from ..mjcf.law import Activation, Actuators
-from .drives import DCMotor, FirstOrderLag, PIDController, SpeedLimit
+from .drives import DCMotor, FirstOrderLag, PIDController, SpeedLimit, controller_in
 from .pd import ComputedTorque, GravityFeedforward, PDController, gains_from_frequency
 
 __all__ = [
-    "Activation", "Actuators", "ComputedTorque", "DCMotor", "FirstOrderLag",
-    "gains_from_frequency", "GravityFeedforward", "PDController", "PIDController",
-    "SpeedLimit",
+    "Activation", "Actuators", "ComputedTorque", "controller_in", "DCMotor",
+    "FirstOrderLag", "gains_from_frequency", "GravityFeedforward", "PDController",
+    "PIDController", "SpeedLimit",
 ]  # fmt: skip
 
 

@@ -119,7 +119,8 @@ class Drive(StatefulElement):
 def controller_in(element: object) -> PDController | None:
     """Returns the controller that an element is, or holds as its command, if any.
 
-    Of a `PIDController` that is its PD part, which has the reference and the limits.
+    Of a `PIDController` that is its PD part, which has the reference and the limits
+    [N or N m].
     """
     while isinstance(element, Drive):
         element = element.command

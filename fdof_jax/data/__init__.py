@@ -1,12 +1,14 @@
-"""Tables of motions, files of pytrees, and export to other engines."""
+"""Tables of motions and results, files of pytrees, and export to other engines."""
 
+from ..base.report import Report
 from ..mjcf.reading import MjcfModel, from_mjcf
 from ..mjcf.writing import to_mjcf
 from .files import load, save
 from .tables import to_pandas, to_xarray
 
 __all__ = [
-    "from_mjcf", "load", "MjcfModel", "save", "to_mjcf", "to_pandas", "to_xarray",
+    "from_mjcf", "load", "MjcfModel", "Report", "save", "to_mjcf", "to_pandas",
+    "to_xarray",
 ]  # fmt: skip
 
 

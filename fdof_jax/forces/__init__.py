@@ -2,6 +2,7 @@
 
 from ..linkage.fields import Condition, Part, Values, field, of_kind
 from .actuators import Armature, LinearActuator, Rotor
+from .added_inertia import present
 from .element import Element, InertialElement, StatefulElement, elements_on
 from .holders import Brake, HardStops, JointFriction, stribeck
 from .joints import EffortHistory, JointDamper, JointEffort, JointSpring, JointStops
@@ -14,8 +15,9 @@ __all__ = [
     "Armature", "Brake", "clip", "Condition", "EffortHistory", "Element", "elements_on",
     "field", "HardStops", "InertialElement", "JointDamper", "JointEffort",
     "JointFriction", "JointSpring", "JointStops", "LinearActuator", "Load", "of_kind",
-    "Part", "Payload", "Point", "PointElement", "Reset", "Rotor", "SpringDamper",
-    "StatefulElement", "stribeck", "switch", "Tension", "Values", "Wrench",
+    "Part", "Payload", "Point", "PointElement", "present", "Reset", "Rotor",
+    "SpringDamper", "StatefulElement", "stribeck", "switch", "Tension", "Values",
+    "Wrench",
 ]  # fmt: skip
 
 

@@ -11,7 +11,7 @@ from jax import Array
 from ..base.checks import refusal
 from ..linkage.linkage import Linkage
 from ..mechanics.equations import Upper
-from .element import Element, Forces, InertialElement, elements_on
+from .element import Element, Forces, InertialElement, elements, elements_on
 
 _ANY = np.zeros(())  # a time: masses that never change are the same at all
 
@@ -22,8 +22,14 @@ def inertial(forces: Forces) -> tuple[InertialElement, ...]:
 
 
 def present(forces: Forces, t: Array) -> Forces:
-    """Returns the elements as they are at a time."""
-    return tuple(e.at(t) if isinstance(e, InertialElement) else e for e in forces)
+    """Returns the elements as they are at a time, for functions without a time.
+
+    **Arguments:** `forces`: a tuple of elements; `t`: time [s].
+
+    **Raises:** ValueError if `forces` is not a tuple of force elements.
+    """
+    found = elements("forces", forces)
+    return tuple(e.at(t) if isinstance(e, InertialElement) else e for e in found)
 
 
 def _without_times(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:

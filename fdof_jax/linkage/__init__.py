@@ -1,1 +1,15 @@
-"""Linkages: their links and joints, coordinates and singularities."""
+"""What an arm is: links, joints, coordinates, frames, singular arms."""
+
+from .coordinates import State
+from .frames import Frames, link_frames
+from .linkage import Linkage, joint_names, moving_joints
+from .topology import TOPOLOGIES, existence_factors
+
+__all__ = [
+    "existence_factors", "Frames", "joint_names", "link_frames", "Linkage",
+    "moving_joints", "State", "TOPOLOGIES",
+]  # fmt: skip
+
+
+def __dir__() -> list[str]:
+    return __all__

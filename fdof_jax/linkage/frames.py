@@ -8,9 +8,10 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
+from ..base.checks import check_known, real_numbers
 from ..base.known_values import in_numpy
 from ..base.trigonometry import sincos
-from .linkage import Linkage
+from .linkage import Linkage, check_linkage, joints_of, without_fixed
 from .topology import real_joints
 
 Rows = Any  # arrays of JAX or NumPy, or lists of scalars
@@ -83,9 +84,19 @@ def frames(linkage: Linkage, q: Array) -> Frames:
     return Frames(jnp.append(0, jnp.cumsum(steps)), direction, angle, slide, revolute)
 
 
-def known_frames(linkage: Linkage, q: ArrayLike) -> Frames:
-    """Computes frames in NumPy at known positions (time, n), 0 at fixed pairs."""
-    count, n = np.shape(q)
+def link_frames(linkage: Linkage, q: ArrayLike) -> Frames:
+    """Computes where the links are along a motion, for pictures and measurements.
+
+    **Arguments:** `linkage`; `q`: joint positions (time, n) [m or rad].
+
+    **Returns:** `Frames` in NumPy, with an axis of times before the others.
+
+    **Raises:** ValueError for malformed arguments and within JAX's transformations.
+    """
+    check_linkage(linkage)
+    check_known("q", linkage, q)
+    q = without_fixed(linkage, real_numbers("q", q, (None, joints_of(linkage))))
+    count, n = q.shape
     # Powers of two: each number of rows needs a program.
     rows = np.resize(q, (1 << count.bit_length(), n))
     found = in_numpy(_frames_of_each(linkage, rows))

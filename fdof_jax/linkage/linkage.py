@@ -19,7 +19,15 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..base.checks import is_traced, known, radians, real_array, real_numbers, shown
+from ..base.checks import (
+    instance,
+    is_traced,
+    known,
+    radians,
+    real_array,
+    real_numbers,
+    shown,
+)
 from ..base.frozen import Frozen
 from ..base.functions import sharing_functions
 from ..base.known_values import known_array
@@ -134,12 +142,20 @@ def short(value: Array | np.ndarray) -> str:
 
 
 def joint_names(linkage: Linkage) -> list[str]:
-    """Returns the names of the joints in order, for instance R1, P2, F3."""
+    """Returns the names of the joints in order, for instance R1, P2, F3.
+
+    **Raises:** ValueError if `linkage` is not a linkage.
+    """
+    instance("linkage", linkage, Linkage)
     return [f"{kind}{k + 1}" for k, kind in enumerate(linkage.topology)]
 
 
 def moving_joints(linkage: Linkage) -> list[int]:
-    """Returns the places of the joints that are not fixed, from 0."""
+    """Returns the indices, from 0, of the joints that are not fixed.
+
+    **Raises:** ValueError if `linkage` is not a linkage.
+    """
+    instance("linkage", linkage, Linkage)
     return [k for k, kind in enumerate(linkage.topology) if kind != "F"]
 
 
@@ -149,11 +165,17 @@ def joints_of(linkage: Linkage) -> int:
 
 
 def per_joint(name: str, values: ArrayLike, linkage: Linkage) -> Array | np.ndarray:
-    """Returns values as an array with one per joint (n,), or raises ValueError.
+    """Returns values as an array with one per joint, (n,).
 
-    Numbers stay in NumPy: programs take them in a fortieth of the time in which JAX
-    makes an array of its own.
+    It stays in NumPy unless it is traced, or JAX's already: programs take it in a
+    fortieth of the time in which JAX makes an array of its own.
+
+    **Arguments:** `name`: of the argument, for messages; `values`: for instance joint
+    positions [m or rad]; known ones named "q" that look like degrees bring a warning.
+
+    **Raises:** ValueError for all but n finite real numbers.
     """
+    instance("linkage", linkage, Linkage)
     n = joints_of(linkage)
     if isinstance(values, jax.Array | np.ndarray) and values.ndim > 1:
         raise ValueError(

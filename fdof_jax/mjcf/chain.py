@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import Linkage
-from .checks import plain, refusal
+from ..checks import plain, refusal
 from .source import Model
 
 Data = Any  # an `mujoco.MjData`

@@ -1,16 +1,8 @@
-"""Checks of arguments, and words of messages."""
+"""Known numbers, as models of MuJoCo have them: in double precision."""
 
 import numpy as np
 
-
-def plain(text: str) -> str:
-    """Returns a text on one line, without control codes, cut if it is long."""
-    return "".join(filter(str.isprintable, " ".join(text.split())))[:200]
-
-
-def refusal(name: str, expected: str, got: object) -> ValueError:
-    """Returns the error to raise for a malformed argument."""
-    return ValueError(f"{name}: expected {expected}, got {plain(repr(got))}.")
+from ..checks import refusal
 
 
 def real_numbers(name: str, values: object, shape: tuple[int, ...]) -> np.ndarray:

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import Element, Linkage, State
+from ..checks import refusal
 from .actuators import actuators
 from .chain import Chain, Reader, planar_chain
-from .checks import refusal
 from .elements import elements_in_joints, springs_of_tendons
 from .source import compiled_model
 

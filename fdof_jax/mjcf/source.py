@@ -10,7 +10,7 @@ from typing import Any
 from xml.etree import ElementTree
 from xml.parsers import expat
 
-from .checks import plain, refusal
+from ..checks import plain, refusal
 
 Model = Any  # an `mujoco.MjModel`, of which type checkers know nothing
 Node = ElementTree.Element

@@ -21,6 +21,7 @@ from .. import (
     SpringDamper,
     State,
 )
+from ..checks import refusal
 from ..forces import (
     Armature,
     HardStops,
@@ -31,7 +32,7 @@ from ..forces import (
 )
 from ..simulation import accepts_scene
 from .chain import FAR
-from .checks import real_numbers, refusal
+from .checks import real_numbers
 from .law import Actuators
 from .source import Node, child
 

@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import jax
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
@@ -11,11 +12,9 @@ from matplotlib.path import Path
 from matplotlib.typing import ColorType
 from numpy.typing import ArrayLike
 
-from ..base.checks import real_numbers
-from ..base.known_values import in_numpy
-from ..forces.element import Forces
-from ..linkage.frames import known_frames
-from ..linkage.linkage import Linkage, check_linkage, joints_of, without_fixed
+from .. import Linkage
+from ..checks import real_array
+from ..linkage import link_frames
 from .axes import ACCENT, BLACK, GREY, SERIES, Keywords, xy
 from .elements import ELEMENT_STYLES, element_lines, element_marker
 
@@ -49,7 +48,7 @@ class Geometry(NamedTuple):
 
 
 def geometry(
-    linkage: Linkage, q: ArrayLike, ts: ArrayLike | None = None, forces: Forces = ()
+    linkage: Linkage, q: ArrayLike, ts: ArrayLike | None = None, forces: tuple = ()
 ) -> Geometry:
     """Computes the points of a linkage's parts along a motion, for other renderers.
 
@@ -63,13 +62,11 @@ def geometry(
     >>> fj.drawing.geometry(arm, [[0, 0, 0]]).points["tip 3"].tolist()  # [m]
     [[(3+0j)]]
     """
-    check_linkage(linkage)
-    q = np.asarray(real_numbers("q", q, (None, joints_of(linkage))))
+    f = link_frames(linkage, q)
     if ts is not None:
-        ts = np.asarray(real_numbers("ts", ts, (len(q),)))
-    arm = in_numpy(linkage)
+        ts = np.asarray(real_array("ts", ts, (len(f.angle),)))
+    arm = jax.device_get(linkage)
     kinds = arm.topology
-    f = known_frames(arm, without_fixed(arm, q))
     start, direction = f.start, f.direction
     end = start + arm.length * direction
     # Mass centres, projected on their links and in their places.

@@ -9,9 +9,8 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..base.checks import refusal
-from ..linkage.linkage import Linkage, check_linkage
-from ..simulation.solution import Solution, check_joints
+from .. import Linkage, Solution
+from ..checks import check_joints, check_linkage, refusal
 
 Keywords = dict[str, Any]  # of functions of matplotlib
 # Okabe and Ito's colours, distinct under the common kinds of colour blindness.

@@ -30,10 +30,16 @@ from matplotlib.typing import ColorType
 from numpy.typing import ArrayLike
 from PIL import Image
 
-from ..base.checks import instance, real_array, refusal, shown, whole_number
-from ..forces.element import Forces
-from ..linkage.linkage import Linkage, check_linkage, per_joint
-from ..simulation.solution import Solution
+from .. import Linkage, Solution
+from ..checks import (
+    check_linkage,
+    instance,
+    per_joint,
+    real_array,
+    refusal,
+    shown,
+    whole_number,
+)
 from .arms import Geometry, draw_arm, draw_ground, draw_motion, geometry
 from .axes import (
     BLACK,
@@ -72,7 +78,7 @@ def draw_linkage(
     q: ArrayLike,
     ax: Axes | None = None,
     *,
-    forces: Forces = (),
+    forces: tuple = (),
     color: ColorType | None = None,
     alpha: float = 1.0,
     mass_centers: bool = True,
@@ -193,7 +199,7 @@ def topology_grid(
     motions: Mapping[str, tuple[Linkage, Solution]],
     fig: Figure | None = None,
     *,
-    forces: Mapping[str, Forces] | None = None,
+    forces: Mapping[str, tuple] | None = None,
     configurations: int = 3,
 ) -> Figure:
     """Draws linkages side by side, each with a few configurations and its tip's path.
@@ -217,7 +223,7 @@ def animate(
     solution: Solution,
     ax: Axes | None = None,
     *,
-    forces: Forces = (),
+    forces: tuple = (),
     until: float | None = None,
     fps: float = 25,
     speed: float = 1.0,
@@ -250,7 +256,7 @@ def animate_grid(
     motions: Mapping[str, tuple[Linkage, Solution]],
     fig: Figure | None = None,
     *,
-    forces: Mapping[str, Forces] | None = None,
+    forces: Mapping[str, tuple] | None = None,
     fps: float = 25,
     speed: float = 1.0,
     max_frames: int = 250,
@@ -271,7 +277,7 @@ def animate_grid(
 
 
 def _geometries(
-    motions: Mapping[str, tuple[Linkage, Solution]], forces: Mapping[str, Forces] | None
+    motions: Mapping[str, tuple[Linkage, Solution]], forces: Mapping[str, tuple] | None
 ) -> dict[str, tuple[np.ndarray, Geometry]]:
     """Times and geometry of each motion, with its force elements, by title."""
     filled_mapping("motions", motions, "(Linkage, Solution)")

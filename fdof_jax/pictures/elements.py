@@ -5,17 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.path import Path
 
-from ..base.known_values import in_numpy
-from ..forces.actuators import LinearActuator
-from ..forces.element import Element, Forces, elements_on
-from ..forces.holders import HardStops
-from ..forces.joints import JointStops
-from ..forces.payload import Payload
-from ..forces.points import Point, SpringDamper, Tension, Wrench
-from ..linkage.frames import Frames
-from ..linkage.linkage import Linkage
-from ..references.reference import Reference
-from ..references.task import TipTask
+from .. import Element, LinearActuator, Linkage, Point, SpringDamper, TipTask, Wrench
+from ..forces import HardStops, JointStops, Payload, Tension, elements_on
+from ..linkage import Frames
+from ..references import Reference
 from .axes import BLACK, Keywords, xy
 
 # Widths are in sizes of the arm.
@@ -35,7 +28,7 @@ ELEMENT_STYLES: dict[str, Keywords] = {
 
 
 def element_lines(
-    linkage: Linkage, forces: Forces, f: Frames, ts: np.ndarray, size: float
+    linkage: Linkage, forces: tuple, f: Frames, ts: np.ndarray, size: float
 ) -> dict[str, np.ndarray]:
     """Lines (time, points) of the elements that have a place, as x + iy [m].
 
@@ -46,7 +39,7 @@ def element_lines(
     given = elements_on(linkage, forces)
     for element in given:
         element.check(linkage, jnp.asarray(ts))
-    acting = in_numpy(given)
+    acting = jax.device_get(given)
     pushes = {
         k: _push(element, linkage, f, ts)
         for k, element in enumerate(acting)

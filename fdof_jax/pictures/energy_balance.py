@@ -3,18 +3,20 @@
 import jax
 import numpy as np
 
-from ..dynamics import energy
-from ..forces.added_inertia import present
-from ..forces.element import Forces, InertialElement, elements
-from ..forces.holders import Holder
-from ..linkage.linkage import Linkage
-from ..simulation.efforts import acting_in, joint_efforts
-from ..simulation.solution import Solution
+from .. import Linkage, Solution, energy, joint_efforts
+from ..forces import (
+    Brake,
+    HardStops,
+    InertialElement,
+    JointFriction,
+    elements_on,
+    present,
+)
 from .axes import reached
 
 
 def energy_balance(
-    linkage: Linkage, forces: Forces, solution: Solution
+    linkage: Linkage, forces: tuple, solution: Solution
 ) -> tuple[np.ndarray, dict[str, np.ndarray], np.ndarray]:
     """Returns times, energies by name, and what was there and put in, their sum [J].
 
@@ -23,23 +25,25 @@ def energy_balance(
     contacts, blows beside dampers, jumps, and commands that begin to act with a delay.
     """
     ts, q, qd = reached(linkage, solution)
-    forces = acting_in(solution, elements("forces", forces))
-    energies = lambda t, q, qd: energy(linkage, q, qd, present(forces, t))
+    efforts = np.asarray(joint_efforts(linkage, forces, solution).elements)
+    controls = int(solution.acting is not None)  # which hold until the next sample
+    acting = elements_on(linkage, forces[controls:])
+    energies = lambda t, q, qd: energy(linkage, q, qd, present(acting, t))
     kinetic, potential = map(np.asarray, jax.vmap(energies)(ts, q, qd))
     potential = potential - potential.min()
 
-    efforts = np.asarray(joint_efforts(linkage, forces, solution).elements)
-    changes, changed = [], np.zeros(len(ts) - 1, bool)  # from sample to sample [J]
-    for k, (element, tau) in enumerate(zip(forces, efforts)):
+    efforts = np.nan_to_num(efforts[:, : len(ts)])  # NaN: a command ends a motion
+    between = (efforts[:, 1:] + efforts[:, :-1]) / 2
+    between[:controls] = efforts[:controls, :-1]
+    works = np.sum(between * np.diff(q, axis=0), axis=2)
+    changes = [*works[:controls]]  # from sample to sample [J]
+    changed = np.zeros(len(ts) - 1, bool)
+    for element, work in zip(acting, works[controls:]):
         if isinstance(element, InertialElement):
             weights = jax.vmap(lambda t, of=element: of.at(t).weights(linkage))(ts)
             changed |= np.diff(weights, axis=0).any(axis=1)
-        if isinstance(element, Holder) and element.counted:
+        if isinstance(element, JointFriction | HardStops | Brake) and element.counted:
             continue  # `solution.taken` has it, exactly
-        tau = np.nan_to_num(tau[: len(ts)])  # a command that ends a motion is NaN
-        held = solution.acting is not None and k == 0  # until the next sample
-        effort = tau[:-1] if held else (tau[1:] + tau[:-1]) / 2
-        work = np.sum(effort * np.diff(q, axis=0), axis=1)
         # Efforts of an inertial element are without those of its potential energy.
         if element.potential_energy and not isinstance(element, InertialElement):
             stored = lambda q, of=element.potential_energy: of(q, linkage)

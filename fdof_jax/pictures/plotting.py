@@ -14,13 +14,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ..base.checks import instance
-from ..control.drives import controller_in
-from ..dynamics import link_energies
-from ..forces.element import Forces, elements, elements_on
-from ..linkage.linkage import Linkage, joint_names, moving_joints
-from ..simulation.efforts import joint_efforts
-from ..simulation.solution import Solution
+from .. import Linkage, Solution, joint_efforts, link_energies
+from ..checks import instance
+from ..control import controller_in
+from ..forces import elements_on
+from ..linkage import joint_names, moving_joints
 from .arms import geometry, link_color
 from .axes import (
     ACCENT,
@@ -59,7 +57,7 @@ def motion_profile(
     solution: Solution,
     fig: Figure | None = None,
     *,
-    forces: Forces = (),
+    forces: tuple = (),
     absolute: bool = False,
     title: str | None = None,
 ) -> Figure:
@@ -120,14 +118,14 @@ def motion_profile(
 
 
 def _references(
-    linkage: Linkage, forces: Forces, ts: np.ndarray
+    linkage: Linkage, forces: tuple, ts: np.ndarray
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Returns times and positions (time, n) of the references of all controllers.
 
     A reference that jumps has times at its jumps and right before them.
     """
     paths = []
-    for controller in map(controller_in, elements("forces", forces)):
+    for controller in map(controller_in, elements_on(linkage, forces)):
         if controller:
             jumps = controller.jump_ts
             jumps = np.zeros(0) if jumps is None else np.ravel(jumps)
@@ -161,7 +159,7 @@ def energy_profile(
 
 
 def energy_stack(
-    linkage: Linkage, forces: Forces, solution: Solution, ax: Axes | None = None
+    linkage: Linkage, forces: tuple, solution: Solution, ax: Axes | None = None
 ) -> Axes:
     """Plots the energy balance over time, stacked [J].
 
@@ -196,7 +194,7 @@ def energy_stack(
 
 
 def effort_profile(
-    linkage: Linkage, forces: Forces, solution: Solution, fig: Figure | None = None
+    linkage: Linkage, forces: tuple, solution: Solution, fig: Figure | None = None
 ) -> Figure:
     """Plots the efforts of each element over time, a panel per joint [N or N m].
 
@@ -260,7 +258,7 @@ def effort_profile(
     return fig
 
 
-def _names(forces: Forces) -> list[str]:
+def _names(forces: tuple) -> list[str]:
     """Returns the names of the elements' classes, of plain functions their own."""
     return [f.__name__ if isfunction(f) else type(f).__name__ for f in forces]
 

@@ -1,6 +1,6 @@
 """Pictures of the tip's path beside the commanded one, and of its distance from it."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from itertools import cycle
 from typing import NamedTuple
 
@@ -12,12 +12,9 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import ListedColormap
 
-from ..base.checks import refusal, shown
-from ..linkage.linkage import Linkage
-from ..references.reference import reference_of
-from ..references.task import CircleTask, TipReference, TipTask
-from ..references.timing import Laps
-from ..simulation.solution import Solution
+from .. import CircleTask, Linkage, Solution, TipTask
+from ..checks import refusal, shown
+from ..references import Laps, Reference
 from .arms import geometry
 from .axes import (
     SERIES,
@@ -45,9 +42,10 @@ class _Tip(NamedTuple):
 
 
 def _tip(
-    linkage: Linkage, task: Callable, solution: Solution, name: str = "solution"
+    linkage: Linkage, task: Reference, solution: Solution, name: str = "solution"
 ) -> _Tip:
-    if not callable(task) or (tip := reference_of(task).tip) is None:
+    tip = getattr(task, "tip", None)
+    if isinstance(task, type) or not callable(tip):
         raise refusal("task", "a CircleTask or a TipTask", task)
     ts, q, _ = reached(linkage, solution, name)
     commanded = np.asarray(jax.vmap(tip)(jnp.asarray(ts))) @ [1, 1j]
@@ -55,7 +53,7 @@ def _tip(
 
 
 def _tips(
-    linkage: Linkage, task: Callable, solutions: Mapping[str, Solution]
+    linkage: Linkage, task: Reference, solutions: Mapping[str, Solution]
 ) -> dict[str, _Tip]:
     filled_mapping("solutions", solutions, "Solution")
     tips = {}
@@ -66,7 +64,9 @@ def _tips(
     return tips
 
 
-def _draw_commanded(ax: Axes, task: Callable, ts: np.ndarray, path: np.ndarray) -> None:
+def _draw_commanded(
+    ax: Axes, task: Reference, ts: np.ndarray, path: np.ndarray
+) -> None:
     """Draws the commanded path dashed above the others, which show in its gaps.
 
     Dashes of a second turn would fill the gaps of the first.
@@ -79,7 +79,7 @@ def _draw_commanded(ax: Axes, task: Callable, ts: np.ndarray, path: np.ndarray) 
 
 def tracking(
     linkage: Linkage,
-    task: TipReference,
+    task: Reference,
     solutions: Mapping[str, Solution],
     ax: Axes | None = None,
 ) -> Axes:
@@ -104,7 +104,7 @@ def tracking(
 
 
 def tracking_by_error(
-    linkage: Linkage, task: TipReference, solution: Solution, ax: Axes | None = None
+    linkage: Linkage, task: Reference, solution: Solution, ax: Axes | None = None
 ) -> Axes:
     """Plots the path of the tip, coloured by its distance from its set point [mm].
 
@@ -138,7 +138,7 @@ def tracking_by_error(
 
 def tracking_error(
     linkage: Linkage,
-    task: TipReference,
+    task: Reference,
     solutions: Mapping[str, Solution],
     ax: Axes | None = None,
 ) -> Axes:

@@ -11,7 +11,6 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..analysis.measures import relative_demands
 from ..base.checks import check_known, function, instance, real_array, refusal
 from ..control.pd import PDController
 from ..forces.element import Element
@@ -142,13 +141,36 @@ def joint_errors(scene: Scene, solution: Solution) -> Float[Array, " residual"]:
     return errors.reshape(-1) / solution.ts.size**0.5
 
 
+def demands(
+    controller: PDController, linkage: Linkage, solution: Solution
+) -> Float[Array, "time joint"]:
+    """Computes a controller's demands along a motion, 0 at fixed pairs [N or N m]."""
+    along = jax.vmap(controller.demand, in_axes=(0, 0, 0, None))
+    found = along(solution.ts, solution.q, solution.qd, linkage)
+    return without_fixed(linkage, found)
+
+
+@eqx.filter_jit
+def relative_demands(
+    controller: PDController, linkage: Linkage, solution: Solution
+) -> Float[Array, "time joint"]:
+    """The controller's demands over its limits; 0 at fixed pairs and infinite limits.
+
+    Where a limit is 0, a demand other than 0 gives an infinity of its sign.
+    """
+    demanded = demands(controller, linkage, solution)
+    limit = jnp.broadcast_to(controller.limit, demanded.shape)
+    beyond = jnp.where(demanded == 0, 0, jnp.sign(demanded) * jnp.inf)
+    return jnp.where(limit > 0, demanded / jnp.where(limit > 0, limit, 1), beyond)
+
+
 def _demands_and_efforts(scene: Scene, solution: Solution) -> tuple[Array, Array]:
     """The controller's demands and efforts over its limits, (time, joint) each."""
     controller = controller_of(scene)
-    demands = relative_demands(controller, scene.linkage, solution)
+    shares = relative_demands(controller, scene.linkage, solution)
     # An actuator with a limit of 0 makes no effort, whatever its demand.
-    most = jnp.broadcast_to(jnp.where(controller.limit > 0, 1, 0), demands.shape)
-    return demands, jnp.clip(demands, -most, most)
+    most = jnp.broadcast_to(jnp.where(controller.limit > 0, 1, 0), shares.shape)
+    return shares, jnp.clip(shares, -most, most)
 
 
 class Tracking(Part):

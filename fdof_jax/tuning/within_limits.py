@@ -10,9 +10,14 @@ from jax import Array
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-from ..analysis.linearization import checked, equilibrium, loop_matrices
-from ..analysis.loops import loops_of, margins
-from ..analysis.measures import BAND, demands, step_measures
+from ..analysis import (
+    closed_loop,
+    equilibrium,
+    loop_matrices,
+    margins,
+    open_loop,
+    step_measures,
+)
 from ..base.checks import instance
 from ..base.known_values import in_numpy
 from ..base.report import Report
@@ -31,6 +36,7 @@ from .losses import (
     bounds_of,
     check_tuned,
     controller_of,
+    demands,
     gain_jacobian,
     gains_of,
     residuals_of,
@@ -45,6 +51,7 @@ from .result import gain_rows, gain_table
 _SPANS, _BANDS = 13, 8
 _FREQUENCIES = 200
 _MARGIN = "modulus margin"
+_BAND = 0.02  # share of a step in which its response has settled
 # The search aims this far within the limits, so that motions sampled more finely are
 # within them too.
 _WITHIN = 5e-4
@@ -106,14 +113,14 @@ def excess(
         over = jnp.where(still, -1, share_now - 1 - limits.overshoot)
         # From the sample before, as the response may settle between both.
         late = (t + ts[1] > limits.settling_time) & ~still
-        unsettled = jnp.where(late, jnp.abs(share_now - 1) - BAND, -1)
+        unsettled = jnp.where(late, jnp.abs(share_now - 1) - _BAND, -1)
         return jnp.stack([over, unsettled, jnp.abs(demand) / limits.effort - 1])
 
     demand = demands(controller, scene.linkage, solution)
     along = _largest(jax.vmap(at)(ts, share, demand), _SPANS)
     if not with_margins:
         return along
-    A, B, C, _ = loop_matrices(scene.linkage, controller, others, rest, scene.t1)
+    A, B, C, _ = loop_matrices(scene.linkage, rest, controller, others, scene.t1)
     near = jax.vmap(lambda s: limits.modulus_margin * jnp.abs(s) - 1)
     return jnp.concatenate([along, _largest(near(sensitivity(A, B, C)), _BANDS)])
 
@@ -126,9 +133,8 @@ def _largest(values: Array, blocks: int) -> Array:
 
 def controller_and_others(scene: Scene) -> tuple[PDController, tuple[Element, ...]]:
     """Returns the controller of a scene and its other forces."""
-    controller, acting = controller_of(scene), checked(scene.linkage, scene.forces)
-    rows = zip(acting, scene.forces)
-    return controller, tuple(e for e, force in rows if force is not controller)
+    controller = controller_of(scene)
+    return controller, tuple(e for e in scene.forces if e is not controller)
 
 
 def rest_of(scene: Scene) -> Array:
@@ -176,14 +182,15 @@ def measured(scene: Scene, limits: Limits) -> Iterator[tuple[str, str, float, fl
     controller, others = controller_and_others(scene)
     limits = in_numpy(limits)
     linkage, t1, rest = scene.linkage, float(scene.t1), rest_of(scene)
-    loops, responses = zip(*loops_of(linkage, rest, controller, others, t1))
-    fastest = np.abs(responses[0].poles()).max()
+    moving, names = moving_joints(linkage), joint_names(linkage)
+    of_joint = lambda system, k: system(linkage, rest, controller, k + 1, others, t1)
+    fastest = np.abs(of_joint(closed_loop, moving[0]).poles()).max()
     ts = np.linspace(0, t1, _samples_of(t1, fastest) + 1)
     motion = simulate(scene, ts, throw=False)
     shares, speeds, _ = map(np.asarray, step_shares(motion, rest))
     efforts = np.abs(demands(controller, linkage, motion)).max(axis=0)
-    for k, loop in zip(moving_joints(linkage), loops):
-        joint = joint_names(linkage)[k]
+    for k in moving:
+        joint = names[k]
         overshoot, _, settled = step_measures(ts, shares[:, k], speeds[:, k], 1.0)
         unit = "N m" if joint[0] == "R" else "N"
         rows = (
@@ -196,7 +203,7 @@ def measured(scene: Scene, limits: Limits) -> Iterator[tuple[str, str, float, fl
                 yield label, joint, float(most[k]), float(value)
         if limits.modulus_margin[k] > 0:
             least = float(limits.modulus_margin[k])
-            yield _MARGIN, joint, least, margins(loop).modulus
+            yield _MARGIN, joint, least, margins(of_joint(open_loop, k)).modulus
 
 
 def _samples_of(t1: float, fastest: float) -> int:
@@ -404,7 +411,7 @@ def tune_within(
     instance("limits", limits, Limits)
     check_tuned("scene", scene, loss)
     check_joints("limits.", limits, scene.linkage)
-    controller_and_others(scene)  # raises for elements with a state
+    rest_of(scene)  # raises for elements with a state
     box = bounds_of(scene, factor, bounds)
     max_steps = check_search(max_steps, report)
     limits = sized(limits, joints_of(scene.linkage))

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from .. import drawing, energy, joint_efforts
-from ..forces import InertialElement, elements_on
+from ..forces import elements_on, present
 from .lines import lines_of
 from .motions import Motion
 
@@ -117,12 +117,7 @@ def _energies(motion: Motion) -> tuple[np.ndarray, np.ndarray]:
     controls = int(solution.acting is not None)
     forces = elements_on(motion.linkage, motion.forces[controls:])
 
-    def of_row(t, q, qd):
-        present = tuple(
-            e.at(t) if isinstance(e, InertialElement) else e for e in forces
-        )
-        return energy(motion.linkage, q, qd, present)
-
+    of_row = lambda t, q, qd: energy(motion.linkage, q, qd, present(forces, t))
     energies = jax.vmap(of_row)(solution.ts, solution.q, solution.qd)
     kinetic, potential = (np.asarray(values)[rows] for values in energies)
     return kinetic, potential

@@ -5,11 +5,9 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jax.core import Tracer
 
 from .. import Linkage, Scene, Solution
-
-_MOST_SHOWN = 200  # characters of a message that repeat what was given
+from ..checks import check_known, instance, refusal
 
 
 class Motion(NamedTuple):
@@ -20,14 +18,6 @@ class Motion(NamedTuple):
     solution: Any  # a Solution, in NumPy
     forces: tuple[Any, ...]
     rows: int
-
-
-def refusal(name: str, expected: str, got: object) -> ValueError:
-    """Returns the error to raise for a malformed argument."""
-    text = "".join(filter(str.isprintable, " ".join(repr(got).split())))
-    if len(text) > _MOST_SHOWN:
-        text = f"{text[: _MOST_SHOWN - 3]}..."
-    return ValueError(f"{name}: expected {expected}, got {text}.")
 
 
 def motions_of(linkage: Any, solution: Any, forces: Any) -> list[Motion]:
@@ -70,11 +60,9 @@ def _members(title: str, given: dict[str, Any], place: str) -> list[Motion]:
     elif forces is None:
         given = given | {"forces": ()}
     for name, kind in ("linkage", Linkage), ("solution", Solution):
-        if not isinstance(given[name], kind):
-            raise refusal(name + place, f"a {kind.__name__}", given[name])
-        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(given[name])):
-            raise refusal(name + place, "known values", given[name])
-    linkage, solution = (_in_numpy(given[name]) for name in ("linkage", "solution"))
+        instance(name + place, given[name], kind)
+        check_known(name + place, given[name])
+    linkage, solution = jax.device_get((given["linkage"], given["solution"]))
     batch, joints = np.shape(solution.q)[:-2], np.shape(linkage.ef)[-1] // 2
     if np.ndim(solution.q) < 2 or np.shape(solution.q)[-1] != joints:
         expected = f"a motion of {joints} joints, as the linkage has"
@@ -94,11 +82,6 @@ def _members(title: str, given: dict[str, Any], place: str) -> list[Motion]:
     if not found:
         raise refusal("solution" + place, "at least one finite row", solution)
     return found
-
-
-def _in_numpy(tree: Any) -> Any:
-    known = lambda leaf: np.asarray(leaf) if isinstance(leaf, jax.Array) else leaf
-    return jax.tree.map(known, tree)
 
 
 def _at(index: tuple[int, ...], batch: tuple[int, ...], tree: Any) -> Any:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import fdof_jax as fj
-from fdof_jax.analysis.measures import relative_demands
+from fdof_jax.tuning.losses import relative_demands
 from hard.scenes import START, TARGET, Hold, arm
 
 STILL = np.zeros(3)

@@ -1,17 +1,15 @@
 """Loops of a controller about a configuration, as systems of python-control."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.checks import check_known, instance, one_of, real_array, refusal
-from ..forces.element import Forces, elements_on
-from ..forces.holders import check_free
-from ..linkage.linkage import Linkage, joint_names, moving_joints, per_joint
-from ..simulation.prescribed import prescribed
-from .linearization import checked, loop_matrices
+from .. import Linkage
+from ..analysis import loop_matrices
+from ..checks import check_known, instance, one_of
+from ..linkage import joint_names, moving_joints
 
 if TYPE_CHECKING:
     import control
@@ -28,7 +26,7 @@ def open_loop(
     q: ArrayLike,
     controller: Callable,
     joint: int,
-    forces: Forces = (),
+    forces: tuple = (),
     t: ArrayLike = 0.0,
 ) -> "control.StateSpace":
     """Breaks the loop of a controller at one joint's effort, about a configuration.
@@ -60,7 +58,7 @@ def open_loop(
     >>> complex(loop(5.278j))  # at 5.278 rad/s, where |L| = 1
     (-0.962-0.273j)
     """
-    return loops_of(linkage, q, controller, forces, t, [joint])[0][0]
+    return _loop_of(linkage, q, controller, joint, forces, t)[0]
 
 
 def closed_loop(
@@ -68,7 +66,7 @@ def closed_loop(
     q: ArrayLike,
     controller: Callable,
     joint: int,
-    forces: Forces = (),
+    forces: tuple = (),
     t: ArrayLike = 0.0,
 ) -> "control.StateSpace":
     """Linearises how a joint follows its reference, about a configuration.
@@ -94,34 +92,29 @@ def closed_loop(
     >>> fj.analysis.bandwidth(response)
     8.103
     """
-    return loops_of(linkage, q, controller, forces, t, [joint])[0][1]
+    return _loop_of(linkage, q, controller, joint, forces, t)[1]
 
 
-def loops_of(
-    linkage: Linkage, q: ArrayLike, controller: Callable, forces: Forces,
-    t: ArrayLike = 0.0, joints: Sequence[int] | None = None,
-) -> list[tuple[Loop, Loop]]:  # fmt: skip
-    """Returns the loops of joints, by default of all, and responses to references."""
+def _loop_of(
+    linkage: Linkage,
+    q: ArrayLike,
+    controller: Callable,
+    joint: int,
+    forces: tuple,
+    t: ArrayLike,
+) -> tuple[Loop, Loop]:
+    """Returns the loop of a joint, and its response to its reference."""
     import control
 
-    forces, moving = checked(linkage, forces), moving_joints(linkage)
-    numbers = [k + 1 for k in moving]
-    indices = [one_of("joint", joint, numbers) - 1 for joint in joints or numbers]
-    if not callable(controller) or isinstance(controller, type):
-        expected = "a force element, a PDController for instance"
-        raise refusal("controller", expected, controller)
-    (element,) = elements_on(linkage, (controller,))
-    check_free("controller", element)
-    if prescribed((element,)) is not None:
-        raise refusal("controller", "one that computes efforts", controller)
-    q, t = per_joint("q", q, linkage), real_array("t", t, ())
-    check_known("q", linkage, element, forces, q, t)
-    matrices = loop_matrices(linkage, element, forces, q, t)
+    check_known("q", linkage, controller, forces, q, t)
+    moving, joints = moving_joints(linkage), len(linkage.topology)
+    k = one_of("joint", joint, [k + 1 for k in moving]) - 1
+    matrices = loop_matrices(linkage, q, controller, forces, t)
     A, B, C, F = (np.asarray(matrix, float) for matrix in matrices)
     # Left out are states of fixed pairs, and those of the controller that act on no
     # joint, such as an integral of a fixed pair, or that nothing changes.
     paths = np.linalg.matrix_power((A != 0) + np.eye(len(A)), len(A)) > 0
-    both = [*moving, *(q.size + k for k in moving)]  # positions and velocities
+    both = [*moving, *(joints + k for k in moving)]  # positions and velocities
     driven = paths[:, both].any(axis=1) | (paths @ F.any(axis=(0, 2)))
     states = np.flatnonzero(paths[both].any(axis=0) & driven)
     A, B, C, F = A[np.ix_(states, states)], B[states], C[:, states], F[:, states]
@@ -129,15 +122,12 @@ def loops_of(
     # s (s I - A)^-1 = I + A (s I - A)^-1 the first part reaches no position at once.
     position, rate, acceleration = F
     position = position + A @ (rate + A @ acceleration)
-    found = []
-    for k in indices:
-        column, row, name = B[:, [k]], C[[k]], joint_names(linkage)[k]
-        loop = control.ss(A + column @ row, column, row, 0, name=f"loop of {name}")
-        at_joint = (states == k).astype(float)[None]
-        through = at_joint @ A @ acceleration[:, [k]]
-        following = A, position[:, [k]], at_joint, through
-        found.append((loop, control.ss(*following, name=f"response of {name}")))
-    return found
+    column, row, name = B[:, [k]], C[[k]], joint_names(linkage)[k]
+    loop = control.ss(A + column @ row, column, row, 0, name=f"loop of {name}")
+    at_joint = (states == k).astype(float)[None]
+    through = at_joint @ A @ acceleration[:, [k]]
+    following = A, position[:, [k]], at_joint, through
+    return loop, control.ss(*following, name=f"response of {name}")
 
 
 class Margins(NamedTuple):

@@ -2,35 +2,21 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy
 from jax import Array
-from jaxtyping import Float, PyTree
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..base.checks import check_known, real_array, refusal
-from ..base.report import Report
-from ..control.drives import Drive, controller_in
-from ..control.pd import PDController
-from ..forces.element import Forces, elements
-from ..linkage.linkage import (
-    Linkage,
-    check_linkage,
-    joint_names,
-    joints_of,
-    moving_joints,
-    without_fixed,
-)
-from ..references.reference import reference_motion
-from ..simulation.efforts import acting_in
-from ..simulation.field import element_effort, with_states
-from ..simulation.simulate import check_own
-from ..simulation.solution import Solution, check_joints
+from .. import Linkage, PDController, Solution, joint_efforts
+from ..checks import check_joints, check_known, check_linkage, real_array, refusal
+from ..control import controller_in
+from ..data import Report
+from ..forces import StatefulElement, elements_on
+from ..linkage import joint_names, moving_joints
 
-BAND = 0.02  # around the final value, in which a response has settled
+_BAND = 0.02  # around the final value, in which a response has settled
 _SETTLED = 0.9  # part of the duration before which it has to
 _STANDS = 1e-9  # changes of a reference that are less are none [m or rad]
 
@@ -89,7 +75,7 @@ class Response(Report):
                 lines.append(f"{name}: no step, as its reference moves meanwhile")
             elif np.isnan(overshoot):
                 lines.append(f"{name}: no step, as it begins at its reference")
-            elif abs(error) > BAND * abs(step):
+            elif abs(error) > _BAND * abs(step):
                 share = 100 * abs(error / step)
                 lines.append(
                     f"{name} ends {share:.2g} % of its step away from the reference; "
@@ -99,7 +85,7 @@ class Response(Report):
 
 
 def response(
-    linkage: Linkage, forces: Forces, solution: Solution, *, since: ArrayLike = -np.inf
+    linkage: Linkage, forces: tuple, solution: Solution, *, since: ArrayLike = -np.inf
 ) -> Response:
     """Measures how a motion followed the reference of its controller.
 
@@ -141,10 +127,7 @@ def response(
     if np.ndim(solution.q) != 2:
         expected = "one motion (of a batch, pass one member)"
         raise refusal("solution", expected, solution)
-    forces = elements("forces", forces)
-    acting = acting_in(solution, forces)
-    check_own("solution.own", solution.own, acting, linkage, solution.ts.shape)
-    controller, efforts = _controller(linkage, forces, acting, solution)
+    controller, efforts = _controller(linkage, forces, solution)
     ts, last = np.asarray(solution.ts), float(solution.ts[-1])
     begin = max(float(real_array("since", since, (), finite=False, unit="s")), ts[0])
     if not begin < last:
@@ -158,8 +141,8 @@ def response(
     path = scipy.interpolate.CubicHermiteSpline(ts, q, qd)
     efforts = efforts[ts >= begin]
     ts = np.append(begin, ts[ts > begin])
-    q, qd, reference = path(ts), path(ts, 1), controller.reference
-    wanted, _ = jax.vmap(lambda t: reference_motion(reference, t, linkage))(ts)
+    q, qd = path(ts), path(ts, 1)
+    wanted = jax.vmap(lambda t: controller.schedule(t, linkage)[0])(ts)
     wanted = np.asarray(wanted)[:, moving]
     error, step = q - wanted, wanted[-1] - q[0]
     still = np.ptp(wanted[1:], axis=0) < _STANDS
@@ -170,7 +153,7 @@ def response(
         for change, rate, steps in zip((q - q[0]).T, qd.T, stands)
     ]  # fmt: skip
     overshoot, rise_time, settled = np.transpose(measures)
-    limits = np.broadcast_to(controller.limit, joints_of(linkage))[moving]
+    limits = np.asarray(controller.limit)[moving]
     return Response(
         joints=tuple(names[k] for k in moving),
         step=np.where(still, step, np.nan),
@@ -185,42 +168,56 @@ def response(
 
 
 def _controller(
-    linkage: Linkage, forces: Forces, acting: Forces, solution: Solution
+    linkage: Linkage, forces: tuple, solution: Solution
 ) -> tuple[PDController, Array]:
     """Returns the controller among elements, and its efforts along a motion.
 
-    It may be the command of a drive, whose states have the command's. In its place,
-    `acting` has the held efforts of sampled control.
+    It may be the command of a drive, whose states have the command's.
     """
-    found = []
-    for element, (_, acts, state) in zip(forces, with_states(acting, solution.own)):
-        while isinstance(acts, Drive):
-            acts, state = acts.command, state.command
-        if (controller := controller_in(element)) is not None:
-            found.append((controller, acts, state))
+    efforts = joint_efforts(linkage, forces, solution).elements
+    given = elements_on(linkage, forces)
+    found = [(k, c) for k, e in enumerate(given) if (c := controller_in(e)) is not None]
     if len(found) != 1:
         expected = "one controller with a reference, or one drive that holds one"
         raise refusal("forces", expected, forces)
-    ((controller, acts, state),) = found
-
-    def effort(t: Array, q: Array, qd: Array, state: PyTree) -> Array:
-        return element_effort(0, acts, t, q, qd, linkage, state)
-
+    ((k, controller),) = found
+    acts: Any = given[k]
+    sampled = int(solution.acting is not None)  # the first, which then has no state
+    if k < sampled or not hasattr(acts, "command"):
+        return controller, efforts[k]
+    state = solution.own[sum(isinstance(e, StatefulElement) for e in given[sampled:k])]
+    while hasattr(acts, "command"):
+        acts, state = acts.command, state.command
+    effort = lambda t, q, qd, state: acts.act(t, q, qd, linkage, state)[0]
     return controller, jax.vmap(effort)(solution.ts, solution.q, solution.qd, state)
 
 
 def step_measures(
-    ts: np.ndarray, change: np.ndarray, rate: np.ndarray, final: float
+    ts: ArrayLike, change: ArrayLike, rate: ArrayLike, final: ArrayLike
 ) -> tuple[float, float, float]:
-    """Measures a response and its rate of change by python-control's `step_info`.
+    """Measures any response to a step, of the tip for instance, from its samples.
 
-    Returns the overshoot as a share of the final change, the rise time (NaN if 90 % is
-    not reached), and the time after which the response is settled (NaN if it is not at
-    the end).
+    **Arguments:** `ts`: times since the step (time,) [s]; `change`, `rate`: what
+    responds, less its first value, and its derivative (time,), between which cubics
+    are taken; `final`: the change that is meant to be.
+
+    **Returns:** the overshoot as a share of the final change, the rise time [s] (NaN if
+    90 % is not reached), and the time after which the response stays within 2 % [s]
+    (NaN if it is not at the end); all NaN if `final` is 0 or others are not finite.
+
+    **Raises:** ValueError for malformed arguments.
     """
     import control
 
-    if not (final and np.isfinite([change, rate]).all()):
+    ts = np.asarray(real_array("ts", ts, (None,)), float)
+    if ts.size < 2 or (np.diff(ts) <= 0).any():
+        raise refusal("ts", "two or more increasing times", ts)
+    change, rate, final = map(np.asarray, (change, rate, final))
+    for name, values in dict(change=change, rate=rate, final=final).items():
+        shape = () if name == "final" else ts.shape
+        if values.shape != shape or values.dtype.kind not in "iuf":
+            raise refusal(name, f"real numbers of shape {shape}", values)
+    if not final or not np.isfinite([*change, *rate, final]).all():
         return np.nan, np.nan, np.nan
     # `step_info` measures to the nearest sample: within 3e-4 of a time with these.
     fine = np.union1d(ts, np.geomspace(ts[1] / 100, ts[-1], 2**16))
@@ -228,30 +225,7 @@ def step_measures(
     rises = part.max() >= 0.9  # else `step_info` raises IndexError
     limits = (0.1, 0.9) if rises else (-np.inf, -np.inf)
     info: Any = control.step_info(
-        part, fine, None, 1.0, SettlingTimeThreshold=BAND, RiseTimeLimits=limits
+        part, fine, None, 1.0, SettlingTimeThreshold=_BAND, RiseTimeLimits=limits
     )
     rise_time = info["RiseTime"] if rises else np.nan
     return info["Overshoot"] / 100, rise_time, info["SettlingTime"]
-
-
-def demands(
-    controller: PDController, linkage: Linkage, solution: Solution
-) -> Float[Array, "time joint"]:
-    """Computes a controller's demands along a motion, 0 at fixed pairs [N or N m]."""
-    along = jax.vmap(controller.demand, in_axes=(0, 0, 0, None))
-    found = along(solution.ts, solution.q, solution.qd, linkage)
-    return without_fixed(linkage, found)
-
-
-@eqx.filter_jit
-def relative_demands(
-    controller: PDController, linkage: Linkage, solution: Solution
-) -> Float[Array, "time joint"]:
-    """The controller's demands over its limits; 0 at fixed pairs and infinite limits.
-
-    Where a limit is 0, a demand other than 0 gives an infinity of its sign.
-    """
-    demanded = demands(controller, linkage, solution)
-    limit = jnp.broadcast_to(controller.limit, demanded.shape)
-    beyond = jnp.where(demanded == 0, 0, jnp.sign(demanded) * jnp.inf)
-    return jnp.where(limit > 0, demanded / jnp.where(limit > 0, limit, 1), beyond)

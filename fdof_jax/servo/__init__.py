@@ -1,0 +1,1 @@
+"""What control engineers ask of a servo: its loops, margins and responses."""
