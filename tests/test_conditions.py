@@ -1,11 +1,13 @@
 """Motions that end where a condition is met: closed forms, derivatives, refusals."""
 
+from functools import partial
+
 import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from modes import LOOPS
+from modes import LOOPS, twice
 from scipy.integrate import solve_ivp
 from scipy.special import ellipk
 
@@ -32,7 +34,8 @@ def fall(x, floor=None, **options):
     start = fj.State(jnp.stack([q0]), jnp.stack([qd0]))
     arm = MASS.replace(gravity=gravity)
     motion = fj.simulate(arm, start, [0, 1, 2.0, 9.0], until=above, **options)
-    return jnp.stack([motion.end.t, motion.end.q[0], motion.end.qd[0]])
+    values = jnp.stack([motion.end.t, motion.end.q[0], motion.end.qd[0]])
+    return values, values
 
 
 def fallen(x):
@@ -45,15 +48,16 @@ def fallen(x):
 def test_a_fall_ends_on_the_floor():
     """With first and second derivatives in all numbers, the condition's own too."""
     x = jnp.array([10.0, 1.0, 9.81, 0.3])
-    np.testing.assert_allclose(fall(x), fallen(x), rtol=1e-12)
     expected = jax.jacfwd(fallen)(x)
-    forward = jax.jit(jax.jacfwd(lambda x: fall(x, **FORWARD)), **LOOPS)(x)
-    np.testing.assert_allclose(forward, expected, rtol=1e-10, atol=1e-12)
-    reverse = jax.jit(jax.jacrev(fall), **LOOPS)(x)
-    np.testing.assert_allclose(reverse, expected, rtol=1e-10, atol=1e-12)
-    twice = lambda f: jax.jacfwd(jax.jacfwd(lambda x: f(jnp.append(x, 0.3))))
-    second = jax.jit(twice(lambda x: fall(x, floor=0.3, **FORWARD)), **LOOPS)
-    np.testing.assert_allclose(second(x[:3]), twice(fallen)(x[:3]), atol=1e-10)
+    for jacobian, options in ((jax.jacfwd, FORWARD), (jax.jacrev, {})):
+        slopes_of = jacobian(partial(fall, **options), has_aux=True)
+        slopes, values = jax.jit(slopes_of, **LOOPS)(x)
+        np.testing.assert_allclose(values, fallen(x), rtol=1e-12)
+        np.testing.assert_allclose(slopes, expected, rtol=1e-10, atol=1e-12)
+    on_floor = lambda x: fall(jnp.append(x, 0.3), floor=0.3, **FORWARD)[0]
+    curves, _ = twice(on_floor)(x[:3])
+    exact = jax.jacfwd(jax.jacfwd(fallen))(x)[:, :3, :3]
+    np.testing.assert_allclose(curves, exact, atol=1e-10)
 
 
 @pytest.mark.slow
@@ -102,13 +106,12 @@ def test_a_bar_comes_to_its_lowest_point_in_the_time_of_an_elliptic_integral():
     x = jnp.array([9.81, 1.3, 0.0])  # from level
     at_level = np.sqrt((1 / 12 + 1.3 / 4) / (1.3 * 9.81 / 2)) * ellipk(1 / 2)
     np.testing.assert_allclose(lowest_exactly(x)[0], at_level, rtol=1e-15)
-    np.testing.assert_allclose(lowest(x), lowest_exactly(x), rtol=0, atol=1e-11)
-    forward = jax.jacfwd(lambda x: lowest(x, **FORWARD))
+    curves, (forward, values) = twice(lambda x: lowest(x, **FORWARD))(x)
+    reverse = jax.jit(jax.jacrev(lowest), **LOOPS)(x)
+    np.testing.assert_allclose(values, lowest_exactly(x), rtol=0, atol=1e-11)
     exact = jax.jacfwd(lowest_exactly)
-    for slopes in (forward, jax.jacrev(lowest)):
-        found = jax.jit(slopes, **LOOPS)(x)
-        np.testing.assert_allclose(found, exact(x), rtol=0, atol=1e-10)
-    curves = jax.jit(jax.jacfwd(forward), **LOOPS)(x)
+    for slopes in (forward, reverse):
+        np.testing.assert_allclose(slopes, exact(x), rtol=0, atol=1e-10)
     np.testing.assert_allclose(curves, jax.jacfwd(exact)(x), rtol=0, atol=1e-10)
 
 
@@ -203,7 +206,8 @@ def test_a_jump_that_carries_a_condition_over_its_zero_ends_the_motion_there():
         stop = fj.forces.HardStops(0, jnp.inf, restitution=restitution)
         arm, start = MASS.replace(gravity=gravity), fj.State(q0[None], jnp.zeros(1))
         end = fj.simulate(arm, start, [0, 2.0], (stop,), until=rises, **options).end
-        return jnp.stack([end.t, end.q[0], end.qd[0]])
+        values = jnp.stack([end.t, end.q[0], end.qd[0]])
+        return values, values
 
     def exactly(x):
         q0, gravity, restitution = x
@@ -211,10 +215,12 @@ def test_a_jump_that_carries_a_condition_over_its_zero_ends_the_motion_there():
         return jnp.stack([fast / gravity, 0 * q0, restitution * fast])
 
     x = jnp.array([1.0, 9.81, 0.6])
-    np.testing.assert_allclose(bounced(x), exactly(x), atol=1e-11)
     expected = jax.jacfwd(exactly)(x)
-    for slopes in jax.jacfwd(lambda x: bounced(x, **FORWARD)), jax.jacrev(bounced):
-        np.testing.assert_allclose(jax.jit(slopes, **LOOPS)(x), expected, atol=1e-10)
+    for jacobian, options in ((jax.jacfwd, FORWARD), (jax.jacrev, {})):
+        slopes_of = jacobian(partial(bounced, **options), has_aux=True)
+        slopes, values = jax.jit(slopes_of, **LOOPS)(x)
+        np.testing.assert_allclose(values, exactly(x), atol=1e-11)
+        np.testing.assert_allclose(slopes, expected, atol=1e-10)
     load = fj.forces.Payload(fj.Point(1, 1.0), mass=1.5, begin=0.5, end=2.0)
     slows, arm = lambda t, q, qd, linkage: qd[0] - 1, BAR.replace(gravity=0)
     start = fj.State([0.0], [2.0])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from elements import SHORT
 from modes import ADJOINT, LOOPS
-from test_tangents import POINTS, tangents, tracked
+from test_tangents import ARM, POINTS, tangents, tracked
 
 import fdof_jax as fj
 from fdof_jax import scenes
@@ -22,17 +22,18 @@ def outcome(problem, parameters, adjoint=diffrax.ForwardMode()):
     """Returns the mean squared tip deviation and the last positions.
 
     They are functions of log kp, log kd, log masses and a shift of the start,
-    (8,). The problem (arm, start, controller, times, steps) consists of values
-    only, so one program in forward mode and one in reverse mode serve all tests.
+    (8,). The problem (start, controller, times, steps) consists of values only, so
+    one program in forward mode and one in reverse mode serve all tests. They know the
+    arm's topology.
     """
-    linkage, state0, controller, ts, (steps, dt0) = problem
+    state0, controller, ts, (steps, dt0) = problem
     log_kp, log_kd, log_mass, shift = parameters.reshape(4, 2)
     controller = eqx.tree_at(
         lambda c: (c.kp, c.kd),
         controller,
         (controller.kp * jnp.exp(log_kp), controller.kd * jnp.exp(log_kd)),
     )
-    linkage = eqx.tree_at(lambda x: x.mass, linkage, linkage.mass * jnp.exp(log_mass))
+    linkage = eqx.tree_at(lambda x: x.mass, ARM, ARM.mass * jnp.exp(log_mass))
     solution = fj.simulate(
         linkage,
         state0._replace(q=state0.q + shift),
@@ -86,7 +87,7 @@ STEPS = {"fixed": steps(1e9, 1 / 1024, growth=1.0), "adaptive": steps(1e-13)}
 @pytest.mark.parametrize("kind", STEPS)
 def test_forward_reverse_and_differences_agree(kind):
     scene = POINTS["start"]
-    problem = scene.linkage, scene.state0, scene.forces[0], TS, STEPS[kind]
+    problem = scene.state0, scene.forces[0], TS, STEPS[kind]
     # An ordinary point.
     at = [0.1, -0.2, 0.05, 0.2, -0.1, 0.1, 0.02, 0.1]
     at = jnp.array(at)
@@ -117,7 +118,7 @@ def test_forward_reverse_and_differences_agree(kind):
 @pytest.mark.parametrize("point", POINTS)
 def test_both_modes_are_the_tangents_that_tuning_follows(point):
     scene = POINTS[point]
-    problem = scene.linkage, scene.state0, scene.forces[0], TS, STEPS["adaptive"]
+    problem = scene.state0, scene.forces[0], TS, STEPS["adaptive"]
     *_, gradient = tangents(scene, 1e-11, TS)
     wanted = gradient / 2  # the loss is a mean over both coordinates too
     (slopes, _), _ = forward(problem, jnp.zeros(8))
@@ -155,12 +156,12 @@ def test_both_modes_of_a_damped_arm_equal_differences():
 @pytest.mark.slow
 def test_gradients_at_and_beyond_a_limit_are_finite_and_zero():
     """The efforts are their limits at the start, or everywhere."""
-    linkage, start, (controller,), _ = tracked()
-    demand = jnp.abs(eqx.filter_jit(controller.demand)(0.0, *start, linkage))
+    _, start, (controller,), _ = tracked()
+    demand = jnp.abs(eqx.filter_jit(controller.demand)(0.0, *start, ARM))
     slopes = {}
     for name, limit in (("at", demand), ("beyond", np.full(2, 1e-3))):
         limited = eqx.tree_at(lambda c: c.limit, controller, limit)
-        problem = linkage, start, limited, np.linspace(0, 0.1, 21), steps(1e-11)
+        problem = start, limited, np.linspace(0, 0.1, 21), steps(1e-11)
         slopes[name] = reverse(problem, jnp.zeros(8), jnp.array([0.0, 1.0]))
     assert np.isfinite(slopes["at"]).all()
     of_gains, others = slopes["beyond"][:4], slopes["beyond"][4:]

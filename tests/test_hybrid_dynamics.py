@@ -277,7 +277,7 @@ class Accelerated(Push):
 def on_table(*forces, reference, joints=1, qd=(0.0, 0.0), ts=(0.0, 1.0, 2.0), **more):
     moving = fj.simulation.PrescribedMotion(joints, reference)
     start = fj.State(np.zeros(2), jnp.array([*qd]))
-    return fj.simulate(TABLE, start, np.array(ts), (moving, *forces), **more)
+    return fj.simulate(TABLE, start, jnp.asarray(ts), (moving, *forces), **more)
 
 
 @pytest.mark.slow
@@ -304,27 +304,26 @@ def test_friction_takes_a_load_along_or_lets_it_slip():
 def test_a_kicked_table_slips_under_its_load():
     """The load slides back by m v^2 / (2 f) from the kick on, for a time m v / f."""
 
-    def end(x, **options):
+    def end(x, ts, **options):
         rate, begin, level = x
         friction = fj.forces.JointFriction(level * jnp.array([0.0, 1.0]))
-        motion = on_table(friction, reference=Kick(rate, begin), **options)
+        motion = on_table(friction, reference=Kick(rate, begin), ts=ts, **options)
         return motion.q[-1, 1], motion
 
-    x = jnp.array([0.9, 0.3, 4.0])
-    _, motion = end(x)
+    x, ts = jnp.array([0.9, 0.3, 4.0]), np.array([0.0, 1.0, 2.0])
+    forwards = jax.jit(jax.jacfwd(partial(end, adjoint=FORWARD), has_aux=True), **LOOPS)
+    forward, motion = forwards(x, ts)
     assert motion.events.table["event"].tolist() == ["slips", "sticks"]
     np.testing.assert_allclose(motion.events.table["t [s]"], [0.3, 0.75], atol=1e-12)
     np.testing.assert_allclose(motion.q[1:, 1], -LOAD * 0.9**2 / 8, atol=1e-12)
     np.testing.assert_allclose(motion.taken[-1], LOAD * 0.9**2 / 2, atol=1e-11)
     right = -LOAD * np.array([0.9 / 4, 0, -(0.9**2) / (2 * 4**2)])
-    forward = jax.jacfwd(lambda x: end(x, adjoint=FORWARD)[0])(x)
     np.testing.assert_allclose(forward, right, atol=1e-9)
-    reverse = jax.grad(lambda x: end(x)[0])(x)
+    reverse, _ = jax.jit(jax.grad(end, has_aux=True), **LOOPS)(x, ts)
     np.testing.assert_allclose(reverse, right, atol=1e-9)
-    during = partial(end, ts=(0.0, 0.5, 0.6))
     slides = lambda t: -0.9 * t + 4 * t**2 / (2 * LOAD)  # since the kick
-    np.testing.assert_allclose(during(x)[0], slides(0.3), atol=1e-12)
-    forward = jax.jacfwd(lambda x: during(x, adjoint=FORWARD)[0])(x)
+    forward, during = forwards(x, np.array([0.0, 0.5, 0.6]))
+    np.testing.assert_allclose(during.q[-1, 1], slides(0.3), atol=1e-12)
     np.testing.assert_allclose(
         forward, [-0.3, 0.9 - 4 * 0.3 / LOAD, 0.045 / LOAD], atol=1e-9
     )
@@ -351,44 +350,52 @@ def test_a_load_slips_on_a_table_that_moves_sinusoidally():
     period = 2 * np.pi / PULSE
     share = lambda level: np.pi * level / (2 * LOAD * SHAKE * PULSE**2)
 
-    def slipped(level, **options):
+    @partial(jax.jit, **LOOPS)
+    @partial(jax.jacfwd, has_aux=True)
+    def slipped(level):
         phase = -jnp.arccos(-share(level))
         friction = fj.forces.JointFriction(level * jnp.array([0.0, 1.0]))
         motion = on_table(
             friction, reference=Shaken(phase), qd=(SHAKE * PULSE * jnp.cos(phase), 0.0),
-            ts=(0, period / 2, period, 3 * period), **options,
+            ts=(0, period / 2, period, 3 * period), adjoint=FORWARD,
         )  # fmt: skip
-        return motion.taken[1:] / level, motion
+        distance = motion.taken[1:] / level
+        return distance, (distance, motion)
 
     right = lambda level: (
         4 * SHAKE * jnp.sqrt(1 - share(level) ** 2) * jnp.array([0.5, 1, 3])
     )
-    distance, motion = slipped(3.0)
+    slope, (distance, motion) = slipped(3.0)
     np.testing.assert_allclose(distance, right(3.0), rtol=0, atol=1e-9)
     back = [-right(3.0)[0], 0, 0]
     np.testing.assert_allclose(motion.q[1:, 1], back, rtol=0, atol=1e-9)
-    slope = jax.jacfwd(lambda level: slipped(level, adjoint=FORWARD)[0])(3.0)
     np.testing.assert_allclose(slope, jax.jacfwd(right)(3.0), rtol=0, atol=1e-9)
 
 
 @pytest.mark.slow
 def test_stops_and_brakes_beside_a_kicked_table():
-    kick = Kick(0.9, 0.3)
-    stops = fj.forces.HardStops([-np.inf, -0.18], [np.inf, 1.0], restitution=0.5)
-    motion = on_table(stops, reference=kick)
+    never = np.array(9.0)  # after the end
+
+    def kicked(qd=0.0, stop=-np.inf, braked=never, taken=never):
+        """Returns a motion beside what holds; what does not act shares the program."""
+        upper = np.where(np.isfinite(stop), 1.0, np.inf)
+        stops = fj.forces.HardStops([-np.inf, stop], [np.inf, upper], restitution=0.5)
+        brake = fj.forces.Brake(2, begin=braked, end=braked + 1.3)
+        payload = fj.forces.Payload(fj.Point(2), 2.0, begin=taken)
+        forces = stops, brake, payload
+        return on_table(*forces, reference=Kick(0.9, 0.3), qd=(0.0, qd))
+
+    motion = kicked(stop=-0.18)
     # It comes to the stop 0.2 s after the kick, and bounces off at half the rate.
     np.testing.assert_allclose(motion.events.table["t [s]"], [0.5], atol=1e-12)
     bounced = -0.18 + 0.45 * (np.array([1.0, 2.0]) - 0.5)
     np.testing.assert_allclose(motion.q[1:, 1], bounced, atol=1e-11)
     # A braked load moves with the table, and is left behind no more than it was.
-    brake = fj.forces.Brake(2, begin=0.2, end=1.5)
-    motion = on_table(brake, reference=kick, qd=(0.0, 0.1))
+    motion = kicked(qd=0.1, braked=0.2)
     np.testing.assert_allclose(motion.q[:, 1], [0, 0.02, 0.02], atol=1e-12)
     assert not motion.qd[1:, 1].any()
     # A payload beside it takes momentum of the load alone.
-    payload = fj.forces.Payload(fj.Point(2), 2.0, begin=0.6)
-    motion = on_table(payload, reference=kick)
-    np.testing.assert_allclose(motion.qd[1:, 1], -0.9, atol=1e-12)
+    np.testing.assert_allclose(kicked(taken=0.6).qd[1:, 1], -0.9, atol=1e-12)
 
 
 def test_stops_and_brakes_of_prescribed_joints_are_refused():

@@ -12,7 +12,11 @@ import pytest
 import fdof_jax as fj
 
 CONTROL = diffrax.PIDController(rtol=1e-10, atol=1e-10)
-FREE = elements.PLAIN | elements.WITH_STATE | elements.WITH_INERTIA
+FREE = {
+    "plain": elements.PLAIN,
+    "with state": elements.WITH_STATE,
+    "with inertia": elements.WITH_INERTIA,
+}
 
 
 def end_of(scene, **options):
@@ -32,7 +36,7 @@ def test_diffrax_moves_all_topologies_as_simulate_does_in_one_program():
         return end_of(scene)
 
     for topology in fj.TOPOLOGIES:
-        forces = FREE["PD"], FREE["PID"]
+        forces = elements.ALL["PD"], elements.ALL["PID"]
         scene = fj.Scene(elements.arm(topology), elements.START, forces, 0.5)
         q, qd, own = end(scene)
         motion = fj.simulate(scene, [0, 0.5])
@@ -44,13 +48,16 @@ def test_diffrax_moves_all_topologies_as_simulate_does_in_one_program():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", FREE)
-def test_diffrax_moves_each_element_as_simulate_does(name):
-    scene = fj.Scene(elements.arm("RPR"), elements.START, (FREE[name],), 0.3)
-    q, qd, _ = end_of(scene)
+@pytest.mark.parametrize("kind", FREE)
+def test_diffrax_moves_all_elements_as_simulate_does(kind):
+    forces = tuple(FREE[kind].values())
+    scene = fj.Scene(elements.arm("RPR"), elements.START, forces, 0.3)
+    q, qd, own = end_of(scene)
     motion = fj.simulate(scene, [0, 0.3])
     np.testing.assert_allclose(q, motion.q[-1], atol=1e-8)
     np.testing.assert_allclose(qd, motion.qd[-1], atol=1e-7)
+    states = [np.ravel(rows[-1]) for rows in jax.tree.leaves(motion.own)]
+    np.testing.assert_allclose(own, np.concatenate([[], *states]), atol=1e-7)
 
 
 @pytest.mark.slow

@@ -1,11 +1,13 @@
 """States that jump: closed forms, HardStops as the same law, derivatives, refusals."""
 
+from functools import partial
+
 import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from modes import LOOPS
+from modes import LOOPS, twice
 from scipy.integrate import solve_ivp
 from test_conditions import BAR, FORWARD, HANGS, MASS, height, quarter
 
@@ -89,16 +91,17 @@ def after_jumps(x, **options):
 @pytest.mark.slow
 def test_derivatives_include_the_times_of_jumps():
     x = jnp.array([1.0, 9.81, 0.7, 0.05, 0.1])
-    value = jax.jit(after_jumps, **LOOPS)
+    of_all = twice(lambda x: after_jumps(x, **FORWARD))
+    curves, (forward, _) = of_all(x)
+    reverse = jax.jit(jax.jacrev(after_jumps), **LOOPS)(x)
+    value = lambda x: of_all(x)[1][1]
     steps = 1e-5 * np.eye(5)
     difference = [(value(x + h) - value(x - h)) / 2e-5 for h in steps]
-    forward = jax.jacfwd(lambda x: after_jumps(x, **FORWARD))
-    for slopes in (jax.jit(forward, **LOOPS), jax.jit(jax.jacrev(after_jumps))):
-        np.testing.assert_allclose(slopes(x), np.transpose(difference), atol=1e-7)
-    curve = jax.jit(jax.jacfwd(lambda q0: forward(x.at[0].set(q0))), **LOOPS)
-    of = jax.jit(lambda q0: forward(x.at[0].set(q0)), **LOOPS)
+    for slopes in (forward, reverse):
+        np.testing.assert_allclose(slopes, np.transpose(difference), atol=1e-7)
+    of = lambda q0: of_all(x.at[0].set(q0))[1][0]
     difference = (of(1 + 1e-4) - of(1 - 1e-4)) / 2e-4
-    np.testing.assert_allclose(curve(1.0), difference, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(curves[..., 0], difference, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.slow
@@ -153,7 +156,8 @@ def pinned(x, **options):
     string = fj.Linkage("R", length=[0, 1], com=[[1, 0]], mass=[1], inertia=[0])
     start = fj.State((HANGS - angle)[None], jnp.zeros(1))
     forces = Reset(side, turn), pull
-    return fj.simulate(string, start, [0, 8.2], forces, **options).events.t[:9]
+    times = fj.simulate(string, start, [0, 8.2], forces, **options).events.t[:9]
+    return times, times
 
 
 def pinned_exactly(x):
@@ -167,11 +171,12 @@ def pinned_exactly(x):
 @pytest.mark.slow
 def test_a_string_meets_a_pin_nine_times():
     x = jnp.array([0.6, 0.8])
-    np.testing.assert_allclose(pinned(x), pinned_exactly(x), rtol=0, atol=1e-9)
     expected = jax.jacfwd(pinned_exactly)(x)
-    for slopes in (jax.jacfwd(lambda x: pinned(x, **FORWARD)), jax.jacrev(pinned)):
-        found = jax.jit(slopes, **LOOPS)(x)
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8)
+    for jacobian, options in ((jax.jacfwd, FORWARD), (jax.jacrev, {})):
+        slopes_of = jacobian(partial(pinned, **options), has_aux=True)
+        slopes, times = jax.jit(slopes_of, **LOOPS)(x)
+        np.testing.assert_allclose(times, pinned_exactly(x), rtol=0, atol=1e-9)
+        np.testing.assert_allclose(slopes, expected, rtol=0, atol=1e-8)
 
 
 @pytest.mark.slow
@@ -217,21 +222,23 @@ FLAT = MASS.replace(gravity=0)
 @pytest.mark.slow
 def test_where_a_reset_leaves_its_condition():
     """On its zero, beyond it, or before it, from where it comes again."""
-    turned = lambda t, q, qd, linkage: (q, -qd)
-    ends = [
-        (0.0, turned, 1.0),  # it starts on the zero
-        (-0.5, turned, -0.5),
-        (-0.5, lambda t, q, qd, linkage: (q, 2 * qd), 1.0),  # it goes on
-        (-0.5, lambda t, q, qd, linkage: (q + 0.3, qd), 0.8),
-        (-0.5, lambda t, q, qd, linkage: (q - 0.3, qd), -0.1),  # and twice
-    ]
-    for start, then, end in ends:
-        forces = (Reset(height, then),)
-        motion = fj.simulate(FLAT, fj.State([start], [1.0]), [0, 1.0], forces)
-        np.testing.assert_allclose(motion.q[-1, 0], end, atol=1e-12)
-    soon = Reset(height, lambda t, q, qd, linkage: (q - 1e-9, qd))
-    again = fj.simulate(FLAT, fj.State([-0.5], [1.0]), [0, 1.0], (soon,), throw=False)
-    assert again.outcome == "too many switches"
+
+    def moved(start, shift, factor):
+        jumps = Reset(height, lambda t, q, qd, linkage: (q + shift, factor * qd))
+        start = fj.State([start], [1.0])
+        return fj.simulate(FLAT, start, [0, 1.0], (jumps,), throw=False)
+
+    for start, shift, factor, end in [
+        (0.0, 0.0, -1.0, 1.0),  # it starts on the zero
+        (-0.5, 0.0, -1.0, -0.5),
+        (-0.5, 0.0, 2.0, 1.0),  # it goes on
+        (-0.5, 0.3, 1.0, 0.8),
+        (-0.5, -0.3, 1.0, -0.1),  # and twice
+    ]:
+        np.testing.assert_allclose(
+            moved(start, shift, factor).q[-1, 0], end, atol=1e-12
+        )
+    assert moved(-0.5, -1e-9, 1.0).outcome == "too many switches"
 
 
 @pytest.mark.slow

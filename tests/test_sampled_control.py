@@ -307,18 +307,20 @@ def _end(parts):
         adjoint=diffrax.ForwardMode(),
     )  # fmt: skip
     last = motion.q[-1], motion.qd[-1], motion.tau[20]
-    return jnp.concatenate([*last, motion.taken[-1:], motion.events.t[:2]])
+    end = jnp.concatenate([*last, motion.taken[-1:], motion.events.t[:2]])
+    return end, end
 
 
 @pytest.mark.slow
 def test_joints_are_held_between_samples():
     """Stops, friction, samples and arrivals in one motion, with all derivatives."""
     parts = jnp.array([0.0, 1.0, 0.5, 0.02, 0.007])
-    end, slopes = jax.jit(lambda x: (_end(x), jax.jacfwd(_end)(x)), **LOOPS)(parts)
-    plain = jax.jit(_end, **LOOPS)
-    np.testing.assert_allclose(plain(parts), end, atol=1e-9)
+    jacobian = jax.jacfwd(_end, has_aux=True)
+    both = jax.jit(lambda x: (_end(x)[0], *jacobian(x)), **LOOPS)
+    plain, slopes, end = both(parts)
+    np.testing.assert_allclose(plain, end, atol=1e-9)
     steps = np.array([1e-6, 1e-6, 1e-6, 1e-7, 1e-7])
-    changes = [plain(parts + h) - plain(parts - h) for h in np.diag(steps)]
+    changes = [both(parts + h)[0] - both(parts - h)[0] for h in np.diag(steps)]
     errors = np.abs(slopes - np.transpose(changes) / (2 * steps)).max(axis=0)
     assert (errors < 1e-6 * np.abs(slopes).max(axis=0)).all()
 
@@ -336,10 +338,9 @@ def test_commands_have_gradients():
         return jnp.sum(motion.tau[5] + motion.acting[7])
 
     many = jnp.full((2, 2), 0.1)
-    value = jax.jit(commanded, **LOOPS)
-    slope = jax.jit(jax.grad(commanded), **LOOPS)(1.0, many)
-    difference = (value(1 + 1e-5, many) - value(1 - 1e-5, many)) / 2e-5
-    np.testing.assert_allclose(slope, difference, rtol=1e-7)
+    both = jax.jit(jax.value_and_grad(commanded), **LOOPS)
+    difference = (both(1 + 1e-5, many)[0] - both(1 - 1e-5, many)[0]) / 2e-5
+    np.testing.assert_allclose(both(1.0, many)[1], difference, rtol=1e-7)
     adjoint = dict(adjoint=diffrax.RecursiveCheckpointAdjoint(checkpoints=16))
 
     def end(kp):
@@ -348,10 +349,9 @@ def test_commands_have_gradients():
         motion = fj.simulate_sampled(RODS, BENT, control, 0.02, 8, **options)
         return jnp.sum(motion.tau[5] + motion.q[7])
 
-    slope = jax.jit(jax.grad(end), **LOOPS)(1.0)
-    value = jax.jit(end, **LOOPS)
-    difference = (value(1 + 1e-5) - value(1 - 1e-5)) / 2e-5
-    np.testing.assert_allclose(slope, difference, rtol=1e-7)
+    both = jax.jit(jax.value_and_grad(end), **LOOPS)
+    difference = (both(1 + 1e-5)[0] - both(1 - 1e-5)[0]) / 2e-5
+    np.testing.assert_allclose(both(1.0)[1], difference, rtol=1e-7)
 
 
 @pytest.mark.parametrize("precision", [np.float32, np.float64])
