@@ -74,6 +74,7 @@ def test_conditions():
     times = np.cumsum(phases) - phases[0] / 2
     found = names["swings"].events.table["t [s]"]
     np.testing.assert_allclose(found, times, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(names["drop"].end.t, np.sqrt(2 / 9.81) * 2.5, rtol=1e-11)
     np.testing.assert_allclose(names["multiplier"], [[names["kept"] ** 2]], rtol=1e-9)
     locked = np.sqrt(1.5 * names["one"] * names["two"] / 1.3)
     np.testing.assert_allclose(names["locked"], locked, rtol=1e-10)
@@ -152,6 +153,7 @@ def test_recipes(tmp_path, monkeypatch):
     push = names["fj"].forces.EffortHistory(np.linspace(0, 2.5, 26), names["efforts"])
     upright = names["fj"].simulate(names["cart"], names["down"], [0, 2.5], (push,))
     np.testing.assert_allclose(upright.q[-1], [0, np.pi], atol=1e-6)
+    assert names["fastest"].success
     np.testing.assert_allclose(np.exp(names["fastest"].x[0]), 1, rtol=1e-6)
     np.testing.assert_allclose(names["steady"].q[-1], names["upright"], atol=1e-6)
     assert 0.0220 < (2 * names["best"].cost) ** 0.5 < 0.0226  # the controller: 0.0501

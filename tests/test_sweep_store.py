@@ -127,12 +127,12 @@ def test_damage_is_named_and_solved_again(mixed, stored, undisturbed, solved, da
 
 def test_files_that_are_missing(mixed, stored, undisturbed, solved):
     (stored / "q/c/4/0/0").unlink()
-    with pytest.warns(RuntimeWarning, match="q/c/4/0/0"):
+    with pytest.warns(RuntimeWarning, match="block 4, got q/c/4/0/0 missing;"):
         run(mixed, store=stored)
     (stored / "failed/c/3").unlink()  # as of a block that was not finished
     run(mixed, store=stored)
     (stored / "digests/1").unlink()
-    with pytest.warns(RuntimeWarning, match="block 1: digests/1"):
+    with pytest.warns(RuntimeWarning, match="block 1, got digests/1 missing;"):
         run(mixed, store=stored)
     assert len(solved) == 3 and read(stored) == undisturbed
 
@@ -142,7 +142,7 @@ def test_files_that_changed_places(mixed, stored, undisturbed, solved, name):
     files = [name.format(block) for block in (0, 4)]
     for file, other in zip(files, reversed(files)):
         (stored / file).write_bytes(undisturbed[other])
-    with pytest.warns(RuntimeWarning, match="block [04]: digests/[04]"):
+    with pytest.warns(RuntimeWarning, match="block [04], got digests/[04] of other"):
         run(mixed, store=stored)
     assert solved == [BLOCK] * 2 and read(stored) == undisturbed
 

@@ -17,8 +17,7 @@ from test_drawing import LINKAGE, SOLUTION, made_up, make_linkage, swinging
 
 import fdof_jax as fj
 from fdof_jax import drawing
-from fdof_jax.simulation.conditions import End
-from fdof_jax.simulation.solution import Events
+from fdof_jax.simulation import End, Events
 from fdof_jax.viewer.lines import lines_of
 
 ARM, TIP = make_linkage("RPR"), fj.Point(3, 0.6)
@@ -152,6 +151,26 @@ def test_events_modes_and_ends_are_marked(show):
     marked = [array(data, place) for place in shown["modes"]]
     np.testing.assert_array_equal(np.stack(marked, axis=1), motion.modes[:81])
     assert not shown["ending"]
+
+
+def test_payloads_and_resets_are_marked(show):
+    reset = Events(np.array([0.5]), np.array([0]), np.array([8]), 1)
+    motion = eqx.tree_at(
+        lambda s: s.events, swinging(), reset, is_leaf=lambda leaf: leaf is None
+    )
+    load = fj.forces.Payload(TIP, 0.4, begin=0.3, end=0.6)
+    there = fj.forces.Payload(TIP, 0.1, begin=0.0)  # from the start
+    (shown,) = show(ARM, motion, (there, load))[1]["motions"]
+    assert shown["events"] == [
+        [0.3, "a payload is picked up"], [0.5, "the state is reset"],
+        [0.6, "a payload is released"],
+    ]  # fmt: skip
+
+
+def test_forces_of_a_batch_are_refused():
+    dampers = jax.vmap(fj.JointDamper)(jnp.ones((5, 3)))
+    with pytest.raises(ValueError, match=r"^forces\[0\].* one set of forces\.$"):
+        fj.view(LINKAGE, BATCH, (dampers,))
 
 
 def test_a_failure_is_told(show):

@@ -133,7 +133,8 @@ class Store:
             if self._holds(name):
                 if path.read_bytes() == data:
                     continue
-                self._warn(f"in {path} the metadata of this sweep", "written again")
+                expected = f"in {path} the metadata of this sweep"
+                self._warn(expected, "something else", "written again")
             path.parent.mkdir(parents=True, exist_ok=True)
             with whole_file(path) as file:
                 file.write(data)
@@ -204,8 +205,8 @@ class Store:
                 f"{self.folder}, which {what}."
             )
 
-    def _warn(self, expected: str, done: str) -> None:
-        message = f"sweep: expected {expected}, got something else; it is {done}."
+    def _warn(self, expected: str, got: str, done: str) -> None:
+        message = f"sweep: expected {expected}, got {got}; it is {done}."
         warn(message, RuntimeWarning)
 
     def members(self, block: int) -> slice:
@@ -224,20 +225,23 @@ class Store:
                 continue
             parts = variable.name, "c", str(block), *"0" * len(variable.shape)
             file = "/".join(parts)
-            there = self._holds(file)
+            if not self._holds(file):
+                damage.append(f"{file} missing")
+                continue
             try:
-                if not there:
-                    raise FileNotFoundError
                 values.append(array.blocks[block])
-            except (ValueError, FileNotFoundError):  # ValueError: another checksum
-                damage.append(file)
+            except ValueError:  # another checksum
+                damage.append(f"{file} damaged")
         file = f"digests/{block}"
-        written = (self.folder / file).read_bytes() if self._holds(file) else b""
-        if not damage and written != self._digest(block, values):
-            damage.append(file)
+        if not self._holds(file):
+            damage.append(f"{file} missing")
+        elif not damage:
+            written = (self.folder / file).read_bytes()
+            if written != self._digest(block, values):
+                damage.append(f"{file} of other results")
         if damage:
-            what = f"in {self.folder} the results of block {block}: {', '.join(damage)}"
-            self._warn(what, "solved again")
+            what = f"in {self.folder} the results of block {block}"
+            self._warn(what, ", ".join(damage), "solved again")
             return None
         return values[-1]
 

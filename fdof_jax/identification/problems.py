@@ -167,8 +167,8 @@ def lane(z: Array, problem: Problem) -> Evaluation:
         seen = jnp.asarray(problem.observe(scene, solution))
         if seen.shape != problem.observed.shape:
             raise ValueError(
-                "observed: expected the shape of what `observe` returns, "
-                f"{seen.shape}, got {problem.observed.shape}."
+                "observed: expected the shape of what `observe` returns, by default "
+                f"the ends of links, {seen.shape}, got {problem.observed.shape}."
             )
         misfit = jnp.where(there, seen - problem.observed, 0)
         return (weight * misfit).reshape(-1)

@@ -89,7 +89,7 @@ class Events(eqx.Module):
     - `t`: times [s]; `joint`: numbers of joints, from 1, or 0 for a reset of the state;
       `kind`: codes of the words in `table`. Each has an entry per event, NaN beyond the
       last one.
-    - `count`: how many there were in all.
+    - `count`: how many there were in all, a whole number kept as a float.
     - `table`: a dictionary of columns, "t [s]", "joint" and "event". An event is one
       of: sticks, slips, bounces, rests on its stop, leaves its stop, is braked, is let
       go, is stopped, is reset.

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from .. import drawing, energy, joint_efforts
-from ..forces import elements_on, present
+from ..forces import Payload, elements_on, present
 from .lines import lines_of
 from .motions import Motion
 
@@ -124,14 +124,22 @@ def _energies(motion: Motion) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _events(motion: Motion) -> list[list[Any]]:
-    """Returns the events as time, joint and word."""
+    """Returns the events as time and words, in the order of time."""
     solution, last = motion.solution, motion.solution.ts[motion.rows - 1]
     found = []
     if solution.events is not None:
         table = solution.events.table
         for t, joint, word in zip(table["t [s]"], table["joint"], table["event"]):
-            name = f"{motion.linkage.topology[joint - 1]}{joint}"
+            kind = motion.linkage.topology[joint - 1]
+            name = f"{kind}{joint}" if joint else "the state"
             found.append((t, f"{name} {word}"))
+    # The table has none of payloads, whose times are known.
+    for load in motion.forces:
+        if isinstance(load, Payload):
+            for t, word in (load.begin, "picked up"), (load.end, "released"):
+                if t is not None and solution.ts[0] < t <= last:
+                    found.append((t, f"a payload is {word}"))
+    found.sort(key=lambda event: event[0])
     if solution.end is not None and solution.ended:
         number = int(solution.end.condition)
         found.append((solution.end.t, f"condition {number} ends the motion"))

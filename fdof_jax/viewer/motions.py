@@ -8,6 +8,7 @@ import numpy as np
 
 from .. import Linkage, Scene, Solution
 from ..checks import check_known, instance, refusal
+from ..forces import elements_on
 
 
 class Motion(NamedTuple):
@@ -81,6 +82,12 @@ def _members(title: str, given: dict[str, Any], place: str) -> list[Motion]:
     found = [motion for motion in found if motion.rows]
     if not found:
         raise refusal("solution" + place, "at least one finite row", solution)
+    if batch:
+        try:
+            elements_on(found[0].linkage, given["forces"])
+        except ValueError as error:
+            hint = "All members are drawn with one set of forces."
+            raise ValueError(f"{error} {hint}") from error
     return found
 
 

@@ -57,9 +57,9 @@ def view(
       compares motions, laid over each other or side by side.
     - `linkage`, `forces`: those of the solution. With a dictionary of solutions, each
       may be a dictionary of the same titles; else they are the same for all. A batch of
-      arms belongs to a batch of motions; the forces are the same for all its members.
-      A `Scene` stands for a linkage and its forces, which are then left out; beside a
-      dictionary of solutions, Scenes are in a dictionary too.
+      arms belongs to a batch of motions; all its members are drawn with one set of
+      forces, without a batch axis. A `Scene` stands for a linkage and its forces, which
+      are then left out; beside a dictionary of solutions, Scenes are in a dictionary.
     - `path`: of the file, which is replaced.
 
     **Returns:** a `View`, with the file's `path`; as the last line of a notebook's cell
