@@ -244,17 +244,18 @@ def refused_values(name, function, sound):
                 yield p.name, value, words
 
 
-# What no declaration tells: how messages begin, and what is changed
+# What no declaration tells: rows of how messages begin, what is changed beside sound
+# arguments, and the kind of error unless it is a ValueError
 
 
 def each(words, name, *values):
     return [(words, {name: value}) for value in values]
 
 
-def acting(words, *forces, error=ValueError, **changes):
-    """Returns a row with force elements, the last of which is named."""
-    place = rf"forces\[{len(forces) - 1}\]"
-    return words.replace("@", place), dict(forces=forces, **changes), error
+def acting(words, *acts, error=ValueError, **changes):
+    """Returns a row with force elements; "@" stands for the place of the last."""
+    place = rf"forces\[{len(acts) - 1}\]"
+    return words.replace("@", place), dict(forces=acts, **changes), error
 
 
 def returns(value):
@@ -280,11 +281,11 @@ def spoilt(tree, name, change):
     return eqx.tree_at(place, tree, change(place(tree)))
 
 
-def step(limit, *forces):
+def step(limit, *others):
     """Returns a scene of one joint, which follows no task."""
     bar = fj.Linkage("R", length=[0, 1], com=[[0, 0]], mass=[1], inertia=[1], gravity=0)
     pd = fj.PDController([6.0], [1.0], [limit], references.SetPoint([1.0]))
-    return fj.Scene(bar, fj.State([0.0], [0.0]), (pd, *forces), 4.0)
+    return fj.Scene(bar, fj.State([0.0], [0.0]), (pd, *others), 4.0)
 
 
 def limited(limit):
@@ -347,8 +348,14 @@ MORE = {
          dict(rtol=1e-6, stepsize_controller=FIXED)),
         *each("linkage.mass", "linkage", spoilt(ARM, "mass", lambda a: -a)),
         *each("linkage.length", "linkage", spoilt(ARM, "length", lambda a: a / 0)),
-        *each("linkage.topology", "linkage", spoilt(ARM, "ef", lambda a: a * 0)),
+        *each("linkage.topology", "linkage",
+              *(spoilt(ARM, "ef", change) for change in (
+                  lambda a: a * 0, lambda a: a * np.nan, jnp.ones_like))),
         *each("linkage.locked", "linkage", spoilt(ARM, "locked", lambda a: a[0])),
+        *((rf"state0\.{name}: expected .+, got ",
+           dict(state0=START._replace(**{name: value})))
+          for name in ("q", "qd")
+          for value in (*WRONG, *(wrong for wrong, _ in wrong_numbers(ZERO, {})))),
         # Ends and resets
         *each(r"until: .* got one of shape \(3,", "until", lambda t, q, *_: q),
         *each(r"until: .* number, got \[.*\]", "until", lambda t, q, *_: [q[0]]),
@@ -378,6 +385,8 @@ MORE = {
         acting("@.level: .* numbers for 3 joints", forces.JointFriction(ONES[:, :2])),
         *(acting("@.level: .* array of n", forces.JointFriction(returns(value)))
           for value in (SHAPED, "much")),
+        acting("@.level: expected it to return numbers for 3 joints",
+               forces.JointFriction(returns(np.ones(2)))),
         acting(r"@.coefficient: .* 3 joints.*got 2\.$", fj.JointDamper([1.0, 1])),
         acting("@.coefficient: .* 3 joints.*_axes", stacked(fj.JointDamper(ZERO))),
         # `equinox.tree_at` passes by the constructor.
@@ -460,6 +469,7 @@ MORE = {
         *each(r"start\['a'\]: expected", "start", *({"a": value} for value in (
             np.nan, "heavy", [[1], [2, 3]]))),
         *each("scale: expected a size for 'a'", "start", {"a": 0.0}),
+        *each("scale: expected a size for 'key 0", "start", DICTS[1]),
         *each(r"scale\['a'\]: expected a real number", "scale", {"a": 0}),
         *each("scale: expected a dict with names from", "scale", {"b": 1}),
         *each("bounds: expected a dict with names from", "bounds", {"b": (1, 2)}),
@@ -593,8 +603,11 @@ MORE = {
          dict(level=[1, 2, 3], static=[1, 2])),
         ("static: expected none beside", dict(static=2, speed=1)),
     ],
-    **{name: each("lower: expected less than upper", "lower", 9)
-       for name in ("JointStops", "HardStops")},
+    "HardStops": [
+        *each("lower: expected less than upper", "lower", 9),
+        *each("restitution: expected at most 1", "restitution", 1.1),
+    ],
+    "JointStops": each("lower: expected less than upper", "lower", 9),
     "Brake": each("begin: expected less than end", "begin", 2.0),
     "Payload": [
         ("begin: expected less than", dict(begin=2, end=1)),
@@ -629,6 +642,13 @@ MORE = {
     "JointMove": each("travel: expected a Travel", "travel", 2.0),
 }  # fmt: skip
 
+SLOW = {
+    "next_motion",
+    "simulate",
+    "sweep",
+    "tune",
+    "tune_within",
+}  # to trace or compile
 # Functions for known values alone, and how they tell it
 KNOWN_ALONE = {
     "tune": "scene: expected known", "response": "solution: expected known",

@@ -15,6 +15,7 @@ from refusals import (
     DOUBTFUL,
     KNOWN_ALONE,
     MORE,
+    SLOW,
     UNREADABLE,
     arguments,
     callables,
@@ -86,7 +87,9 @@ def test_wrong_values(name, refuses, searching):
     refuses(name, rows)
 
 
-@pytest.mark.parametrize("name", MORE)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in MORE]
+)
 def test_what_no_declaration_tells(name, refuses):
     refuses(name, MORE[name])
 
