@@ -10,17 +10,7 @@ import jax
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from refusals import (
-    ARM,
-    DOUBTFUL,
-    KNOWN_ALONE,
-    MORE,
-    SLOW,
-    UNREADABLE,
-    arguments,
-    callables,
-    refused_values,
-)  # fmt: skip
+import refusals
 
 import fdof_jax as fj
 from fdof_jax import search
@@ -32,7 +22,7 @@ TRACED = [
     for shape in ((), (7,), (2, 3, 3), (0,))
     for dtype in (float, bool)
 ]
-CALLABLES = callables()
+CALLABLES = refusals.callables()
 
 
 def fault(call, words, error=ValueError):
@@ -82,22 +72,28 @@ def refuses(monkeypatch, tmp_path):
 def test_wrong_values(name, refuses, searching):
     rows = (
         (rf"([^:]*\b)?{place}\b[^:]*: expected .+{words}.*, got .+\.$", {place: value})
-        for place, value, words in refused_values(name, *CALLABLES[name])
+        for place, value, words in refusals.refused_values(name, *CALLABLES[name])
     )
     refuses(name, rows)
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in MORE]
+    "name",
+    [
+        pytest.param(n, marks=[pytest.mark.slow] * (n in refusals.SLOW))
+        for n in refusals.MORE
+    ],
 )
 def test_what_no_declaration_tells(name, refuses):
-    refuses(name, MORE[name])
+    refuses(name, refusals.MORE[name])
 
 
-@pytest.mark.parametrize("name", KNOWN_ALONE)
+@pytest.mark.parametrize("name", refusals.KNOWN_ALONE)
 def test_traced_values_where_known_ones_are_needed(name):
     function, sound = CALLABLES[name]
-    assert not fault(lambda: eqx.filter_jit(function)(**sound), KNOWN_ALONE[name])
+    assert not fault(
+        lambda: eqx.filter_jit(function)(**sound), refusals.KNOWN_ALONE[name]
+    )
 
 
 @pytest.mark.slow
@@ -108,15 +104,13 @@ def test_other_errors_are_meant(name, searching, monkeypatch, tmp_path):
     function, sound = CALLABLES[name]
 
     def call_each(*values):
-        for place in (p.name for p in arguments(function)):
+        for place in (p.name for p in refusals.arguments(function)):
             for value in values:
-                with (
-                    contextlib.suppress(*MEANT),
-                    warnings.catch_warnings(action="ignore"),
-                ):
+                with contextlib.suppress(*MEANT), warnings.catch_warnings():
+                    warnings.simplefilter("ignore")
                     function(**sound | {place: value})
 
-    call_each(*DOUBTFUL)
+    call_each(*refusals.DOUBTFUL)
     # One trace for all values, as a trace takes longer than most calls.
     jax.eval_shape(jax.vmap(call_each), *TRACED)
 
@@ -124,10 +118,12 @@ def test_other_errors_are_meant(name, searching, monkeypatch, tmp_path):
 @pytest.mark.parametrize("kind", [np.float16, np.float32, ">f8", np.int8, np.uint64])
 def test_real_numbers_of_any_type_are_taken(kind):
     ones = np.ones(3).astype(kind)
-    arm = ARM.replace(mass=ones, gravity=ones[0], com=np.ones((3, 2)).astype(kind))
+    arm = refusals.ARM.replace(
+        mass=ones, gravity=ones[0], com=np.ones((3, 2)).astype(kind)
+    )
     for found in (
         arm.mass, arm.gravity, arm.com, fj.JointDamper(ones).coefficient,
-        fj.inverse_dynamics(ARM, ones, ones, ones), fj.tip_position(ARM, ones),
+        fj.inverse_dynamics(arm, ones, ones, ones), fj.tip_position(arm, ones),
     ):  # fmt: skip
         assert found.dtype == float
 
@@ -151,7 +147,7 @@ def test_little_is_formatted(hold):
 
 def test_what_cannot_be_loaded(tmp_path):
     path = tmp_path / "tree.json"
-    for text, words in UNREADABLE.items():
+    for text, words in refusals.UNREADABLE.items():
         path.write_text(text)
         assert not fault(lambda: fj.load(path), rf"{path}: .*{words}.*\.$"), text
     with path.open("wb") as file:
