@@ -32,7 +32,7 @@ LONGEST = {
     "test_chain_motions",
     "test_switches",
     "test_tuning",
-    "test_public_callables",
+    "test_refusals",
 }
 # Doctests that compile much.
 LONG_EXAMPLES = {

@@ -1,4 +1,4 @@
-"""Motions that end where a condition is met: closed forms, derivatives, refusals."""
+"""Motions that end where a condition is met: closed forms, derivatives."""
 
 from functools import partial
 
@@ -261,28 +261,3 @@ def test_what_holds_joints_and_samples_goes_on_until_the_end():
     sampled = fj.simulate_sampled(MASS, start, push, 0.3, 9, until=until)
     np.testing.assert_allclose(sampled.end.t, 1, rtol=1e-9)
     assert np.isnan(sampled.tau[5:]).all() and np.isfinite(sampled.tau[:4]).all()
-
-
-def test_what_is_refused():
-    start = fj.State([1.0], [0.0])
-    end = lambda **options: fj.simulate(MASS, start, [0, 1.0], **options)
-    with pytest.raises(ValueError, match=r"^until: expected .* got one of shape \(1,"):
-        end(until=lambda t, q, qd, linkage: q)
-    with pytest.raises(ValueError, match=r"^until: expected .* number, got \[.*\]"):
-        end(until=lambda t, q, qd, linkage: [q[0]])
-    with pytest.raises(ValueError, match="^until: expected .* number, got 'a'"):
-        end(until=lambda t, q, qd, linkage: "a")
-    with pytest.raises(TypeError, match="^until.condition: expected a function"):
-        end(until=lambda t, q, qd: q[0])
-    with pytest.raises(TypeError, match="^until: expected jax.numpy"):
-        end(until=lambda t, q, qd, linkage: 1.0 if q[0] > 0 else -1.0)
-    with pytest.raises(ValueError, match="^until: expected a function .* got 3"):
-        end(until=3)
-    with pytest.raises(ValueError, match="^until: expected a function"):
-        end(until=())
-    with pytest.raises(
-        ValueError, match=r"^direction: expected one of \(-1, 0, 1\), got 2"
-    ):
-        Until(height, 2)
-    with pytest.raises(ValueError, match=r"a condition that ends the motion \(until\)"):
-        end(until=height, stepsize_controller=diffrax.ConstantStepSize())

@@ -219,35 +219,3 @@ def test_states_of_elements_are_swept():
     exact = 3 * (1 - np.exp(-np.array([0, 1, 2])))
     effort = solution.own[0].own[..., 0]
     np.testing.assert_allclose(effort, np.tile(exact, (5, 1)), atol=1e-9)
-
-
-ONES = fj.JointEffort([1.0])
-OTHER = fj.PDController(1.0, 1.0, 1.0, Hold(jnp.zeros(2)))  # for two joints
-
-
-def run_by(command):
-    fj.simulate(WHEEL, STILL, [0, 1], (LAG.replace(command=command),))
-
-
-REFUSED = {
-    "command: expected a force element": lambda: LAG.replace(command=3.0),
-    r"forces\[0\]\.command: expected an array of 1": lambda: run_by(
-        lambda t, q, qd, linkage: 5.0
-    ),
-    r"forces\[0\]\.command\.reference: expected an .* of 1": lambda: run_by(OTHER),
-    "ki: expected 0 where kp is": lambda: fj.control.PIDController(
-        [1, 1, 0.0], 1.0, 1.0, 1.0, Hold(jnp.zeros(3))
-    ),
-    "time_constant: expected .* above 0": lambda: LAG.replace(time_constant=0.0),
-    "resistance: expected": lambda: fj.control.DCMotor(
-        ONES, resistance=-1, inductance=1, constant=1
-    ),
-    "inductance: expected .* at least 0": lambda: STATIC.replace(inductance=-1),
-    "inductance: expected above 0 in all": lambda: STATIC.replace(inductance=[0, 1]),
-}
-
-
-@pytest.mark.parametrize("message", REFUSED)
-def test_malformed_drives_are_refused(message):
-    with pytest.raises(ValueError, match=f"^{message}"):
-        REFUSED[message]()

@@ -210,3 +210,16 @@ def test_a_function_may_close_over_what_is_differentiated():
 
     with pytest.raises(TypeError, match="^forces: expected differentiated arrays"):
         jax.grad(end)(0.5, controller)
+
+
+def test_modes_that_the_adjoint_does_not_serve_name_the_cure():
+    linkage, start, *_ = scenes.double_pendulum()
+
+    def end(q, **settings):
+        return fj.simulate(linkage, (q, start.qd), [0, 0.01], **settings).q[-1, 0]
+
+    with pytest.raises(TypeError, match=r"adjoint=diffrax\.ForwardMode\(\)"):
+        jax.jacfwd(end)(jnp.zeros(2))
+    slope = jax.grad(lambda q: end(q, adjoint=diffrax.ForwardMode()))
+    with pytest.raises(RuntimeError, match="^reverse-mode .* default adjoint"):
+        jax.eval_shape(slope, jnp.zeros(2))

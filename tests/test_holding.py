@@ -1,4 +1,4 @@
-"""Joints that are held for a while: laws, modes, events, batches, refusals."""
+"""Joints that are held for a while: laws, modes, events, batches."""
 
 import diffrax
 import jax
@@ -354,32 +354,6 @@ def test_an_arm_with_one_of_two_slides_held_keeps_its_energy(joint):
     assert np.ptp(motion.q[:, joint - 1]) == 0
 
 
-@pytest.mark.parametrize(
-    "make, words",
-    [
-        (lambda: JointFriction(2.0, static=1.0), "static: expected at least the level"),
-        (
-            lambda: JointFriction([1, 2, 3], static=[1, 2]),
-            r"level, static: expected arrays of one length, got shapes \(3,\), \(2,\)",
-        ),
-        (lambda: JointFriction(1, static=2, speed=1), "static: expected none beside"),
-        (lambda: HardStops(1.0, -1.0), "lower: expected less than upper"),
-        (lambda: HardStops(-1, 1, restitution=1.1), "restitution: expected at most 1"),
-        (lambda: Brake(0), "joints: expected a number of 1 to 8"),
-        (lambda: Brake(1, 2.0, 1.0), "begin: expected less than end"),
-        (lambda: Payload(fj.Point(1), -1), "mass: expected .* at least 0"),
-        (lambda: Payload(fj.Point(1), 1, begin=2, end=1), "begin: expected less than"),
-        (lambda: Payload(fj.Point(1), 1, velocity=[1]), "velocity: expected two or"),
-        (lambda: Payload(fj.Point(1), 1, velocity=[1, 0]), "velocity: expected zeros"),
-        (lambda: Payload(fj.Point(0), 1), "place: expected a point of a moving link"),
-        (lambda: jax.jit(Brake)(1), "joints: expected known values"),
-    ],
-)
-def test_malformed_elements_are_refused(make, words):
-    with pytest.raises(ValueError, match=f"^{words}"):
-        make()
-
-
 @pytest.mark.slow
 def test_blows_at_the_start_are_events():
     arm, forces = fj.scenes.double_pendulum().linkage, (ANYWHERE, Brake(1, begin=-1))
@@ -388,17 +362,6 @@ def test_blows_at_the_start_are_events():
     assert motion.qd[0, 0] == 0 and motion.taken[0] > 0
     still = run(arm, fj.State([0.3, 0.0], [0.0, 1.0]), [0, 0.1], *forces)
     assert still.events.count == 0
-
-
-def test_what_cannot_go_together_is_refused():
-    fixed = dict(stepsize_controller=diffrax.ConstantStepSize(), dt0=0.01)
-    for forces, options, words in [
-        ((JointFriction(1.0),), fixed, "stepsize_controller: expected an adaptive one"),
-        ((HardStops(-1, 1),) * 2, {}, "forces: expected one HardStops"),
-        ((Brake(2),), {}, r"forces\[0\].joints: expected 1 to 1"),
-    ]:
-        with pytest.raises(ValueError, match=f"^{words}"):
-            run(BAR, REST, [0, 1.0], *forces, **options)
 
 
 # Laws, in scenes at random

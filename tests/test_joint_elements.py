@@ -242,24 +242,7 @@ def test_the_momentum_gained_is_the_integral_of_the_efforts():
         np.testing.assert_allclose(end, expected, atol=1e-8)
 
 
-REFUSED = [
-    (lambda: fj.forces.JointSpring(-1), "stiffness: expected .* at least 0"),
-    (lambda: fj.forces.JointSpring(1, np.inf), "rest: expected"),
-    (lambda: JointStops(1, 1), "lower: expected less than upper"),
-    (lambda: JointStops(np.nan, 1), "lower: expected"),
-    (lambda: JointStops(0, 1, stiffness=0), "stiffness: expected .* above 0"),
-    (lambda: JointStops(0, 1, smoothing=0), "smoothing: expected .* above 0"),
-    (lambda: JointStops(0, 1, damping=-1), "damping: expected .* at least 0"),
-    (lambda: JointFriction(-1), "level: expected .* at least 0"),
-    (lambda: JointFriction(1, speed=0), "speed: expected .* above 0"),
-    (lambda: EffortHistory([0, 0], TAU[:2]), "ts: expected increasing"),
-    (lambda: EffortHistory([], np.zeros((0, 3))), "ts: expected increasing"),
-    (lambda: EffortHistory(TS, TAU[:3]), "tau: expected 4 rows"),
-    (lambda: EffortHistory(TS, TAU[:, 0]), "tau: expected an array"),
-]
-
-
-@pytest.mark.parametrize("make, message", REFUSED)
-def test_malformed_arguments_are_refused(make, message):
-    with pytest.raises(ValueError, match=f"^{message}"):
-        make()
+def test_one_effort_for_all_joints():
+    zero, arm = np.zeros(3), fj.scenes.fig5().linkage
+    found = fj.JointEffort(1.5)(0.0, zero, zero, arm)
+    np.testing.assert_array_equal(found, [1.5] * 3)

@@ -239,36 +239,3 @@ def test_nine_combinations_of_the_parameters_of_an_rpr_arm_are_identified():
     values = np.linalg.svd(matrix, compute_uv=False)
     assert values[8] > 1e-3 * values[0] and values[9] < 1e-12 * values[0]
     np.testing.assert_allclose(matrix[:, 0], 0, atol=1e-12)
-
-
-# Malformed arguments
-
-
-@pytest.mark.parametrize(
-    "element",
-    [
-        fj.control.FirstOrderLag(fj.JointEffort(np.ones(3)), 0.1),
-        fj.simulation.PrescribedMotion(1, Hold(jnp.zeros(3))),
-    ],
-    ids=["state", "prescribed"],
-)
-def test_elements_that_are_no_function_of_the_state_are_refused(element):
-    state = fj.State(STILL, STILL)
-    for call in (
-        lambda: fj.linearize(ROD, state, (element,)),
-        lambda: fj.analysis.equilibrium(ROD, STILL, (element,)),
-        lambda: modes_at(ROD, (element,), (STILL, STILL)),
-    ):
-        with pytest.raises(ValueError, match="forces: expected elements without"):
-            call()
-
-
-def test_modes_are_refused_of_what_is_traced_or_stacked():
-    def of(q):
-        rows = fj.Solution(jnp.zeros(1), q, q, {}, diffrax.RESULTS.successful)
-        return fj.analysis.closed_loop_modes(ROD, (), rows).frequency
-
-    stacked = lambda q: of(q[None])
-    for call, words in (jax.jit(of), "known values"), (stacked, "one motion"):
-        with pytest.raises(ValueError, match=f"solution: expected {words}"):
-            call(jnp.zeros((1, 3)))

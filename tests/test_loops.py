@@ -311,22 +311,3 @@ def test_a_controller_without_a_reference_has_no_bandwidth():
     plain = lambda t, q, qd, linkage: -90 * (q - 0.8) - 6 * qd
     assert np.isfinite(margins(open_loop(PENDULUM, POSITION, plain, joint=1))).all()
     assert np.isnan(bandwidth(closed_loop(PENDULUM, POSITION, plain, joint=1)))
-
-
-def test_loops_of_malformed_arguments_are_refused():
-    linkage, q = arm("RRF")
-    pd = pd_at(q, 1.0, 1.0)
-    prescribed = fj.simulation.PrescribedMotion(1, pd.reference)
-    for controller, joint, forces, message in [
-        (pd, 0, (), r"joint: expected one of \(1, 2\), got 0"),
-        (pd, 3, (), r"joint: expected one of \(1, 2\), got 3"),
-        (pd, 1, (fj.control.FirstOrderLag(pd, 0.1),), "forces: expected elements"),
-        (3.0, 1, (), "controller: expected a force element"),
-        (prescribed, 1, (), "controller: expected one that"),
-    ]:
-        with pytest.raises(ValueError, match=message):
-            open_loop(linkage, q, controller, joint, forces)
-    with pytest.raises(ValueError, match="loop: expected a StateSpace, got"):
-        margins(pd)
-    with pytest.raises(ValueError, match="response: expected a StateSpace, got"):
-        bandwidth(pd)

@@ -1,6 +1,5 @@
-"""Measures of a motion against its reference: closed forms, and what is refused."""
+"""Measures of a motion against its reference: closed forms."""
 
-import jax
 import numpy as np
 import pytest
 
@@ -146,31 +145,3 @@ def test_a_report_is_shown():
     assert "P1: no step, as it begins at its reference" in str(measured(still))
     ramp = PD.replace(reference=Ramp([0, 1], [[0.0], [1.0]]))
     assert "P1: no step, as its reference moves meanwhile" in str(measured(ramp))
-
-
-def test_what_is_refused():
-    forces, response = (PD, fj.JointEffort(0.0)), fj.analysis.response
-    motion = fj.simulate(SLIDE, START, TS, forces)
-    with pytest.raises(ValueError, match="forces: expected one controller"):
-        response(SLIDE, (fj.JointDamper(1.0),), motion)
-    with pytest.raises(ValueError, match="forces: expected one controller"):
-        response(SLIDE, (PD, PD), motion)
-    with pytest.raises(ValueError, match="since: expected a time before .* 6 s"):
-        response(SLIDE, (PD,), motion, since=6.0)
-    with pytest.raises(ValueError, match="solution: expected .* joints"):
-        response(fj.scenes.fig5().linkage, (PD,), motion)
-    batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], motion)
-    with pytest.raises(ValueError, match="solution: expected one motion"):
-        response(SLIDE, (PD,), batch)
-    pid = fj.control.PIDController(1.0, 1.0, 1.0, 1.0, STEP)
-    with pytest.raises(ValueError, match="solution.own: expected the states"):
-        response(SLIDE, (pid,), motion)
-    with pytest.raises(ValueError, match="solution: expected known values"):
-        jax.jit(lambda motion: response(SLIDE, (PD,), motion).step)(motion)
-    stopped = fj.simulate(SLIDE, START, TS, forces, max_steps=3, throw=False)
-    with pytest.raises(ValueError, match="solution: .* reached its end, got .out of"):
-        response(SLIDE, (PD,), stopped)
-    with pytest.raises(ValueError, match="ts: expected two or more increasing"):
-        step_measures([0.0, 0.0], [0.0, 1.0], [0.0, 0.0], 1.0)
-    with pytest.raises(ValueError, match=r"rate: expected real .* shape \(2,\)"):
-        step_measures([0.0, 1.0], [0.0, 1.0], [0.0], 1.0)

@@ -100,30 +100,6 @@ def test_exported_motion_equals_mujoco():
         np.testing.assert_allclose(data.qpos, expected, atol=1e-6)
 
 
-WET = dict(damping=1, one_sided="cable", rest_length=1)
-STATE = fj.control.Activation([1], [[1, 0, 1, 0]], [0])
-LAW = dict(gain=[[0, 0, 0]], bias=[[0, 0, 0]], control=[1])
-UNWRITTEN = {
-    "got GravityFeedforward": fj.control.GravityFeedforward(1, 1, 1, fj.CircleTask()),
-    "states that follow": fj.control.Actuators([[1, 0, 0]], **LAW, activation=STATE),
-    "got function": lambda t, q, qd, linkage: q,
-    "expected one JointDamper": fj.JointDamper(1.0),
-    "expected no damping of a cable": fj.SpringDamper(fj.Point(0), fj.Point(1), **WET),
-    "link: expected": fj.SpringDamper(fj.Point(0), fj.Point(5), stiffness=1),
-}
-
-
-def test_what_mujoco_does_not_have_is_refused_by_name():
-    linkage = random_linkage("RRR", np.random.default_rng(0))
-    for words, force in UNWRITTEN.items():
-        with pytest.raises(ValueError, match=words):
-            fj.to_mjcf(linkage, (fj.JointDamper(1.0), force))
-    with pytest.raises(ValueError, match="linkage"):
-        fj.to_mjcf(jax.tree.map(lambda a: np.stack([a, a]), linkage))
-    with pytest.raises(ValueError, match="linkage: expected one Linkage, and known"):
-        jax.jit(fj.to_mjcf)(linkage)
-
-
 # Both ways
 
 

@@ -110,31 +110,3 @@ def test_parameters_that_nothing_has_told_yet(found):
     )
     assert chosen.improvement == np.inf
     assert np.isfinite(chosen.standard_errors["mass"])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "changes, message",
-    [
-        (dict(experiment=3), "experiment: expected a callable"),
-        (dict(found=GUESS), "found: expected a FitResult"),
-        (dict(start=[1.0]), "start: expected a Mapping"),
-        (dict(start={"efforts": [[1.0], [2.0, 3.0]]}), r"start\['efforts'\]: expected"),
-        (dict(start={"efforts": np.full((3, 1), 9)}), r"bounds\['efforts'\]: expected"),
-        (dict(bounds={"tau": (-1, 1)}), "bounds: expected a dict with names from"),
-        (dict(bounds={}), "bounds: expected finite ones for all of"),
-        (dict(noise=0), "noise: expected a real number"),
-        (dict(ts=TS[::-1]), "ts: expected increasing times"),
-        (dict(within=3), "within: expected a callable"),
-        (dict(observe=3), "observe: expected a callable"),
-        (dict(scale={"mass": 0}), r"scale\['mass'\]: expected a real number"),
-        (
-            dict(within=lambda scene, motion: motion.q),
-            "between -1 and 1 .* got .* entry",
-        ),
-    ],
-)
-def test_malformed_arguments(changes, message, found):
-    arguments = dict(experiment=Pushed, found=found, start=HANGS, ts=TS) | LIMITS
-    with pytest.raises(ValueError, match=message):
-        fj.identification.next_motion(**arguments | changes)

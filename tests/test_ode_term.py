@@ -107,26 +107,6 @@ def test_white_torque_has_the_stationary_variance_of_a_damped_bar():
     assert abs(np.var(ends) - right) < 3 * standard_error
 
 
-@pytest.mark.parametrize(
-    "element, word",
-    [
-        (fj.forces.JointFriction(0.4), "no element that holds joints"),
-        (fj.forces.HardStops(-1, 1), "no element that holds joints"),
-        (fj.forces.Brake(2, begin=0.1, end=0.2), "no element that holds joints"),
-        (
-            fj.simulation.PrescribedMotion(1, fj.references.SetPoint(0.3)),
-            "no PrescribedMotion",
-        ),
-        (fj.forces.Payload(fj.Point(3), 1.0, begin=0.1), "no Payload with a begin"),
-        (lambda t, q, qd, linkage: 0.0, "an array of 3 real numbers"),
-    ],
-)
-def test_what_simulate_alone_can_do_is_refused(element, word):
-    scene = fj.Scene(elements.arm("RRR"), elements.START, (element,), 0.5)
-    with pytest.raises(ValueError, match=word):
-        fj.simulation.ode_term(scene)
-
-
 def test_only_a_scene_is_accepted():
     with pytest.raises(ValueError, match="scene: expected"):
         fj.simulation.ode_term(elements.arm("RRR"))

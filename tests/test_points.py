@@ -132,28 +132,6 @@ def test_where_points_meet_forces_and_derivatives_are_finite():
     assert np.isfinite(slope).all()
 
 
-REFUSED = {
-    "link: expected 0": lambda: fj.Point(9),
-    "link: expected a whole number": lambda: fj.Point(1.5),
-    "along: expected a real number, finite": lambda: fj.Point(1, np.nan),
-    "b: expected a Point": lambda: fj.SpringDamper(A, 3),
-    "stiffness: expected .* at least": lambda: fj.SpringDamper(A, B, stiffness=-1),
-    "one_sided: expected False.* 'rope'": lambda: fj.SpringDamper(
-        A, B, one_sided="rope"
-    ),
-    "one_sided: expected False.* True": lambda: fj.SpringDamper(A, B, one_sided=True),
-    "tension: expected a real number": lambda: fj.forces.Tension(A, B, "x"),
-    "force: expected an array of 2": lambda: fj.Wrench(A, [1, 2, 3]),
-    "follows: expected a bool": lambda: fj.Wrench(A, follows=1),
-}
-
-
-@pytest.mark.parametrize("message", REFUSED)
-def test_malformed_arguments_are_refused(message):
-    with pytest.raises(ValueError, match=f"^{message}"):
-        REFUSED[message]()
-
-
 @pytest.mark.parametrize("topology", fj.TOPOLOGIES)
 def test_velocities_of_points_are_derivatives_of_their_positions(topology):
     arm = random_linkage(topology, np.random.default_rng(1))

@@ -1,8 +1,7 @@
-"""States that jump: closed forms, HardStops as the same law, derivatives, refusals."""
+"""States that jump: closed forms, HardStops as the same law, derivatives."""
 
 from functools import partial
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -290,28 +289,3 @@ def test_functions_that_return_what_cannot_be_are_named(element, words):
     stop = HardStops(-np.inf, 2.0)
     with pytest.raises(RuntimeError, match=words):
         fj.simulate(MASS, fj.State([1.0], [0.0]), [0, 1.0], (element, stop))
-
-
-def test_what_is_refused():
-    start, same = fj.State([1.0], [0.0]), lambda t, q, qd, linkage: (q, qd)
-
-    def run(*arguments, **options):
-        forces = (Reset(*arguments),)
-        return fj.simulate(MASS, start, [0, 1.0], forces, **options)
-
-    with pytest.raises(ValueError, match=r"^forces\[0\].when: expected .* shape \(1,"):
-        run(lambda t, q, qd, linkage: q, same)
-    with pytest.raises(ValueError, match=r"^forces\[0\].then: .*, got no pair"):
-        run(height, lambda t, q, qd, linkage: q)
-    with pytest.raises(ValueError, match=r"^forces\[0\].then: .* \[\(1,\), \(2,\)\]"):
-        run(height, lambda t, q, qd, linkage: (q, jnp.ones(2)))
-    with pytest.raises(ValueError, match=r"^forces\[0\].when: .* of type bool"):
-        run(lambda t, q, qd, linkage: q[0] > 0, same)
-    with pytest.raises(TypeError, match=r"^forces\[0\].then: expected a function"):
-        run(height, lambda q, qd: (q, qd))
-    with pytest.raises(ValueError, match="^when: expected a function"):
-        Reset(3, same)
-    with pytest.raises(ValueError, match="^direction: expected one of"):
-        Reset(height, same, 2)
-    with pytest.raises(ValueError, match="stepsize_controller: expected an adaptive"):
-        run(height, same, stepsize_controller=diffrax.ConstantStepSize())

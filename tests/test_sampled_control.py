@@ -268,30 +268,6 @@ def test_a_failure_is_named():
     assert np.isfinite(motion.q[:2]).all() and np.isnan(motion.q[2:]).all()
 
 
-LAG = fj.control.FirstOrderLag(fj.JointEffort(np.ones(2)), 0.1)
-REFUSED = {
-    "period: expected": dict(period=0.0),
-    "samples: expected": dict(samples=0),
-    "delay: expected": dict(delay=-0.1),
-    "control: expected": dict(control=3.0),
-    "forces: expected": dict(forces=[LAG]),
-    "noise, key: expected": dict(noise=(0.1, 0.1)),
-    "state: expected": dict(state=3.0),
-    "dt: expected": dict(dt=0.0),
-    "forces: expected elements without": dict(dt=0.1, forces=(LAG,)),
-}
-
-
-@pytest.mark.parametrize("name", REFUSED)
-def test_malformed_arguments_are_refused(name):
-    values, call = REFUSED[name], fj.simulate_sampled
-    right = dict(linkage=RODS, state0=BENT, control=CONTROL, period=0.1, samples=2)
-    if "state" in values or "dt" in values:
-        call, right = fj.step, dict(linkage=RODS, state=BENT, tau=np.zeros(2), dt=0.1)
-    with pytest.raises(ValueError, match=f"^{name}"):
-        call(**right | values)
-
-
 LIMITS = fj.forces.HardStops([-0.6, 0.28], [-0.42, 0.5], restitution=0.5)
 RUBS = fj.forces.JointFriction(0.5, 0.8)
 

@@ -97,22 +97,6 @@ def test_ramps_stand_before_and_after_their_times():
         np.testing.assert_allclose(ramp(t, arm), right, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda r: r.Pulse(0, 1, begin=2, end=1), "begin: expected less than end"),
-        (lambda r: r.Ramp([0.0], [[1.0]]), "ts: expected two or more increasing"),
-        (lambda r: r.Ramp([0, 1], [[1.0]]), "q: expected 2 rows, one per time, got 1"),
-        (lambda r: r.Step(0, np.nan), "after: expected"),
-        (lambda r: r.Step([0, 1], [0, 1, 2]), "after: expected as many numbers as be"),
-        (lambda r: r.Pulse([0, 1], [0, 1, 2], begin=0, end=1), "inside: expected as"),
-    ],
-)
-def test_what_is_refused(make, message):
-    with pytest.raises(ValueError, match=message):
-        make(fj.references)
-
-
 # Jumps that throw a controller past its limit, at once
 
 

@@ -72,18 +72,3 @@ def test_a_batch_moves_as_its_members_across_jumps_and_saturation():
         jax.tree.map(
             lambda a, b: np.testing.assert_allclose(a, b, atol=1e-8), own, alone.own
         )
-
-
-@pytest.mark.parametrize(
-    "solver, words",
-    [
-        (diffrax.SemiImplicitEuler(), "solver: expected one of ordinary"),
-        (diffrax.KenCarp4(), "solver: expected one of ordinary"),
-        (diffrax.EulerHeun(), "solver: expected one of ordinary"),
-        (diffrax.Euler(), "solver: expected one that estimates errors"),
-    ],
-)
-def test_methods_of_other_equations_and_without_errors_are_refused(solver, words):
-    scene = fj.scenes.double_pendulum()
-    with pytest.raises(ValueError, match=f"^{words}"):
-        fj.simulate(scene, [0, 1.0], solver=solver)

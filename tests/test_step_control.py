@@ -227,3 +227,11 @@ def test_tolerances_are_as_exact_as_those_of_a_controller_of_ones_own():
     np.testing.assert_allclose(by_name.q, controlled.q, atol=1e-6)
     steps = [int(m.stats["num_steps"]) for m in (by_name, finer, default)]
     assert steps == sorted(steps) and steps[0] < steps[-1]
+
+
+@pytest.mark.parametrize("name", ["rtol", "atol"])
+def test_derivatives_with_respect_to_a_tolerance(name):
+    linkage, state0, *_ = fj.scenes.fig5()
+    last = lambda x: fj.simulate(linkage, state0, [0, 1.0], **{name: x}).q[-1, 0]
+    with pytest.raises(RuntimeError, match=name):
+        jax.eval_shape(jax.grad(last), 1e-6)

@@ -1,5 +1,6 @@
 """A sweep equals jax.vmap(simulate), member by member, or keeps what is asked for."""
 
+import functools
 import sys
 
 import chains
@@ -29,6 +30,7 @@ from sweep_batch import (
 )  # fmt: skip
 
 import fdof_jax as fj
+from fdof_jax.batches import devices
 from fdof_jax.steps.looped_dopri8 import LoopedDopri8
 
 
@@ -300,3 +302,45 @@ def test_an_implicit_solver_finds_its_tolerances():
     )
     alone = fj.simulate(linkage, fj.State(start.q[1], start.qd), [0, 0.2])
     np.testing.assert_allclose(solution.q[1], alone.q, atol=1e-6)
+
+
+def test_no_members():
+    """`vmap` over no members has nothing to raise."""
+    linkage, state0, *_ = fj.scenes.fig5()
+    motion = lambda q: fj.simulate(linkage, state0._replace(q=q), TS)
+    solution = jax.eval_shape(jax.vmap(motion), np.zeros((0, 3)))
+    assert solution.q.shape == (0, len(TS), 3)
+
+
+@pytest.fixture
+def guarded():
+    """Lets no array reach or leave JAX unasked, in any thread."""
+    before = jax.config.jax_transfer_guard
+    jax.config.update("jax_transfer_guard", "disallow")
+    yield
+    jax.config.update("jax_transfer_guard", before)
+
+
+def test_under_a_transfer_guard(batch, guarded, monkeypatch):
+    linkage, state0, *_ = fj.scenes.fig5()
+    monkeypatch.setattr(devices, "cores", lambda: 2)
+    solution = run(batch)
+    motion = fj.simulate(linkage, state0, TS)
+    with jax.transfer_guard("allow"):
+        assert successful(solution).all() and successful(motion)
+
+
+def test_what_a_transformation_cannot_do_is_refused(batch, tmp_path):
+    linkage, state0, _ = batch
+    end = lambda q, **options: fj.sweep(linkage, (q, q), TS, **options).q
+    for options in dict(throw=True), dict(store=tmp_path):
+        with pytest.raises(ValueError, match="^throw, store: expected"):
+            jax.eval_shape(functools.partial(end, **options), state0.q)
+
+
+def test_what_members_share_is_checked():
+    """Warnings are errors in these tests, so that nothing is solved."""
+    stops = fj.forces.JointStops([-1, -1, -1], [1, 1, 90])
+    states = fj.State(np.zeros((2, 3)), np.zeros((2, 3)))
+    with pytest.raises(UserWarning, match=r"^forces\[0\]\.upper: .* radians, got 90"):
+        fj.sweep(fj.scenes.fig5().linkage, states, TS, (stops,))

@@ -3,7 +3,6 @@
 import sys
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -113,21 +112,6 @@ def test_a_table_of_a_batch():
     assert set(failed.index.droplevel("time [s]")) == {(1, 0)}
     one = fj.to_pandas(make_linkage("PRR"), solution(2))
     assert one.index.names == ["batch", "time [s]"]
-
-
-@pytest.mark.parametrize("convert", [fj.to_xarray, fj.to_pandas])
-def test_malformed_arguments_are_named(convert):
-    arm = make_linkage("RRR")
-    with pytest.raises(ValueError, match="^solution: expected a Solution"):
-        convert(arm, solution().q)
-    with pytest.raises(ValueError, match="^linkage: expected a Linkage"):
-        convert("RRR", solution())
-    other = solution(2)
-    other = eqx.tree_at(lambda s: s.ts, other, other.ts.at[1].add(1.0))
-    with pytest.raises(ValueError, match="^solution.ts: expected the same times"):
-        convert(arm, other)
-    with pytest.raises(ValueError, match="outside of JAX"):
-        jax.jit(lambda arm: convert(arm, solution()))(arm)
 
 
 def test_names_of_joints_of_any_number():

@@ -76,15 +76,6 @@ def test_the_shock_takes_the_load_s_frequency_out(frequency):
     assert residual[0] > 1e-3 and residual[1] < 1e-8
 
 
-def test_malformed_travels_are_refused():
-    with pytest.raises(ValueError, match="duration: expected .* above 0"):
-        fj.references.Travel(0.0)
-    with pytest.raises(ValueError, match="profile: expected one of"):
-        fj.references.Travel(1.0, profile="linear")
-    with pytest.raises(ValueError, match="period: expected not zero"):
-        fj.references.Laps(0.0)
-
-
 @pytest.mark.parametrize("profile", PROFILES)
 def test_steps_end_where_the_acceleration_jumps(profile):
     """Only the third derivative of a quintic jumps, at both ends."""

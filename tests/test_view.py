@@ -3,8 +3,6 @@
 import base64
 import json
 import re
-from functools import partial
-from pathlib import Path
 
 import diffrax
 import equinox as eqx
@@ -22,7 +20,6 @@ from fdof_jax.viewer.lines import lines_of
 
 ARM, TIP = make_linkage("RPR"), fj.Point(3, 0.6)
 REST = fj.State([0.0] * 3, [0.0] * 3)
-NOWHERE = made_up(SOLUTION.ts, SOLUTION.q * jnp.nan)
 BATCH = made_up(SOLUTION.ts, jnp.stack([SOLUTION.q] * 3), jnp.zeros((3, 5, 3)))
 
 
@@ -235,43 +232,6 @@ def test_sampled_motions_come_with_their_control(show):
     np.testing.assert_array_equal(np.stack(efforts, axis=1), acting)
 
 
-PAIR = LINKAGE, SOLUTION
-SCENE = fj.Scene(LINKAGE, REST, (), 1.0)
-REFUSED = [
-    ("linkage", fj.view, "RRR", SOLUTION),
-    ("linkage", fj.view, {"a": LINKAGE}, SOLUTION),
-    ("linkage", fj.view, {"a": LINKAGE}, {"b": SOLUTION}),
-    (r"linkage\['a'\]", fj.view, "RRR", {"a": SOLUTION}),
-    ("solution", fj.view, LINKAGE, 3),
-    ("solution", fj.view, LINKAGE, {}),
-    ("solution", fj.view, LINKAGE, {3: SOLUTION}),
-    ("solution", fj.view, LINKAGE, NOWHERE),
-    ("solution", fj.view, fj.scenes.double_pendulum().linkage, SOLUTION),
-    (r"solution\['a'\]", fj.view, LINKAGE, {"a": 3}),
-    ("forces", fj.view, *PAIR, fj.JointDamper(1.0)),
-    ("forces", fj.view, *PAIR, {"a": ()}),
-    ("forces", fj.view, LINKAGE, {"a": SOLUTION}, {"b": ()}),
-    ("forces", fj.view, *PAIR, []),
-    ("forces", fj.view, SCENE, SOLUTION, ()),
-    ("forces", fj.view, {"a": SCENE}, {"a": SOLUTION}, {"a": ()}),
-    ("linkage", fj.view, SCENE, {"a": SOLUTION}),
-    ("linkage", fj.view, {"a": SCENE}, SOLUTION),
-    ("linkage", fj.view, {"a": SCENE}, {"b": SOLUTION}),
-    ("path", partial(fj.view, path=3), *PAIR),
-    ("path", partial(fj.view, path=""), *PAIR),
-    ("path", partial(fj.view, path=Path(__file__).parent), *PAIR),
-    ("path", partial(fj.view, path=Path("no such folder", "a.html")), *PAIR),
-]
-
-
-def test_malformed_arguments_are_named(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    for name, function, *given in REFUSED:
-        with pytest.raises(ValueError, match=f"^{name}: expected"):
-            function(*given)
-    assert not [*tmp_path.iterdir()]
-
-
 def test_what_messages_leave_out_is_told():
     with pytest.raises(ValueError, match=r"got Scene\(linkage=.{183}\.{3}\.$"):
-        fj.view(SCENE, {"a": SOLUTION})
+        fj.view(fj.Scene(LINKAGE, REST, (), 1.0), {"a": SOLUTION})

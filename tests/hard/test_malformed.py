@@ -1,14 +1,13 @@
 """Scene 30: malformed values that no call can check, because they are traced.
 
-Errors that calls raise, for every function and argument, are in tests/test_bad_input.py
-and tests/test_sweep_input.py; locked velocities are in tests/test_linkage.py.
+Errors that calls raise, for every function and argument, are in tests/refusals.py;
+locked velocities are in tests/test_linkage.py.
 """
 
 import functools
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -86,21 +85,3 @@ def test_the_good_ones_do_not_fail():
     # The plain call has a program of its own, which rounds differently. Beside the kink
     # of a saturation that changes steps, whose tolerance is 1e-11.
     np.testing.assert_allclose(solution.q, exact.q, rtol=0, atol=3e-11)
-
-
-INSIDE = {
-    "mass": [[-1, 1, 1], [1, NAN, 1], [1, 1, INF]],
-    "length": [[0, NAN, 1, 1], [0, 1, INF, 1]],
-    "ef": [[0, 1, 1, 1, 0, 1], [0, 1, NAN, NAN, 0, 1]],
-    "kp": [[1, NAN, 1], [1, -1, 1]],
-    "limit": [[1, NAN, 1], [1, -1, 1]],
-}
-
-
-@pytest.mark.parametrize("name", INSIDE)
-def test_modules_changed_after_their_door(name):
-    """`eqx.tree_at` calls no constructor, but a failed call names the values."""
-    argument = "topology" if name == "ef" else name
-    for value in INSIDE[name]:
-        with pytest.raises(ValueError, match=rf"{argument}: expected .*, got "):
-            simulate(**GOOD | {name: jnp.asarray(value, float)}, throw=True)

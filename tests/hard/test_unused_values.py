@@ -78,7 +78,7 @@ def test_parameters_that_a_topology_does_not_use(topology, junk):
     """One compiled program serves all topologies and selects unused values away.
 
     Selections multiply by 0 in reverse mode. NaN in arguments raises an error
-    (tests/test_bad_input.py). If it is traced, it spoils links that only slide, and
+    (tests/refusals.py). If it is traced, it spoils links that only slide, and
     the motion reports it.
     """
     linkage = arm(topology, locked=[0.2, 0.3, 0.4])
