@@ -127,7 +127,7 @@ MUTANTS = {
     ),
     "held joints drift": Mutant(
         "steps/loop.py",
-        "y1 = events.kept(regime, y1, y0)",
+        "y1 = events.held_still(regime, y1, y0)",
         "pass",
         f"{HOLDING}::test_a_brake_holds_to_the_last_bit",
     ),

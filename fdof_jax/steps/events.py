@@ -221,11 +221,11 @@ class Events(eqx.Module):
         after = args._replace(sides=sides, modes=modes)
         if self.resets:
             places = places_of(self.resets)
-            own = sides_after(
+            left = sides_after(
                 self.term, places, at, arrived_as, (there, after), last.sizes
             )
-            own = jnp.where(resets, own, sides[places])
-            sides = sides.at[places].set(own.astype(t.dtype))
+            left = jnp.where(resets, left, sides[places])
+            sides = sides.at[places].set(left.astype(t.dtype))
             after = args._replace(sides=sides, modes=modes)
             there = later(self.term, t - at, at, there, after)
         if self.derivatives:
@@ -259,7 +259,7 @@ class Events(eqx.Module):
 
     # What happens in a step?
 
-    def kept(self, regime: Regime, y1: Integrated, y0: Integrated) -> Integrated:
+    def held_still(self, regime: Regime, y1: Integrated, y0: Integrated) -> Integrated:
         """Returns the end of a step, positions and rates of held joints as before.
 
         Rounding errors of earlier steps, which the compensated sum carries, would still

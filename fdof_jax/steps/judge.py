@@ -109,7 +109,7 @@ class Judge(eqx.Module):
         )
         return NextStep(*plan, result), JudgeState(controller, probe, loss), health  # pyright: ignore[reportCallIssue]
 
-    def settled(
+    def before_next(
         self, after: JudgeState, before: JudgeState, step: NextStep, resumes: Array,
         y1: Integrated,
     ) -> JudgeState:  # fmt: skip

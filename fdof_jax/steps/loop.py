@@ -2,7 +2,9 @@
 
 diffrax documents this way of scheme: its methods take the steps, and its controllers
 choose their lengths. Between the two stands what `diffeqsolve` has no place for: steps
-end where something happens, and are judged by more than their error.
+end where something happens, and are judged by more than their error. What happens (an
+element switches, a joint stops, a state is reset) is done by the step that begins
+there, anew each time it is tried; the one that ended there has only found it.
 """
 
 from typing import Any, NamedTuple
@@ -69,8 +71,9 @@ class Attempt(NamedTuple):
     """The state of the loop: a step to try, and what is known before it.
 
     - `t`, `end`: where the step begins and is to end [s].
-    - `y`: the state at `t`, before what happens there; `jumped`: whether something may
-      happen, None if it never does.
+    - `y`: the state at `t`, before what happens there; `jumped`: whether rates may jump
+      there: the step before ended at a known time or at a switch, or the controller
+      says so. None if they never do.
     - `method`: state of the method. `judged`: that of `Judge`, or without one of the
       controller; `wrappers`: of controllers around the one that judges errors.
     - `landing`, `switches`: states of `Landing` and of `Events`, None without them.
@@ -106,7 +109,7 @@ class _StepResult(NamedTuple):
     """A step that was taken, whether it is kept or not.
 
     - `args`: what is in force in it. `y1`: the state at its end; `path`: there and
-      between. `error`: its estimate, or an `Estimate`.
+      between. `error`: by the method, an `Estimate` if that has checked the end too.
     - `method`, `switches`: states at its end. `failed`: result of the method.
     - `found`: what happens in it.
     """
@@ -186,7 +189,7 @@ def solve(problem: Problem, scheme: Scheme) -> Attempt:
             return goes_on
         return goes_on & (a.switches.ended < 0)
 
-    end = eqx.internal.while_loop(
+    final = eqx.internal.while_loop(
         lambda a: unfinished(a) & (True if most is None else a.steps < most),
         advance,
         _first_attempt(problem, scheme, last),
@@ -199,16 +202,16 @@ def solve(problem: Problem, scheme: Scheme) -> Attempt:
         checkpoints=checkpoints,
     )
     if kind == "lax" and not isinstance(scheme.adjoint, diffrax.ForwardMode):
-        end = eqx.internal.nondifferentiable_backward(
-            end,
+        final = eqx.internal.nondifferentiable_backward(
+            final,
             msg="reverse-mode differentiation of simulate needs an upper bound of its "
             "steps (max_steps) or, with RecursiveCheckpointAdjoint, a number of "
             "checkpoints.",
             symbolic=True,
         )
-    scheme.meter.close(end.meter)
-    result = RESULTS.where(unfinished(end), RESULTS.max_steps_reached, end.result)
-    return end._replace(result=result)
+    scheme.meter.close(final.meter)
+    result = RESULTS.where(unfinished(final), RESULTS.max_steps_reached, final.result)
+    return final._replace(result=result)
 
 
 def _first_attempt(problem: Problem, scheme: Scheme, last: Array) -> Attempt:
@@ -274,8 +277,8 @@ def _taken(problem: Problem, scheme: Scheme, a: Attempt) -> _StepResult:
         args = args._replace(sides=regime.sides, modes=regime.modes)
     if term.settle is not None:
         y0, jumped = term.settle(a.t, y0, args), True  # rates of before are out of date
-    # A controller measures what is left of all blows; its commands move no joint at
-    # once.
+    # After all blows, of which a controller measures what is left; its commands move no
+    # joint at once.
     if term.sample is not None:
         sampled, changed = term.sample(a.t, y0, args)
         args, jumped = args._replace(sampled=sampled), jumped | changed
@@ -285,7 +288,7 @@ def _taken(problem: Problem, scheme: Scheme, a: Attempt) -> _StepResult:
     path = method.interpolation_cls(t0=a.t, t1=a.end, **dense)
     if events is not None:
         assert regime is not None
-        y1 = events.kept(regime, y1, y0)
+        y1 = events.held_still(regime, y1, y0)
         # Looked for in a step that its error may reject, too: whether it is kept is
         # known later, and a batch computes both anyway.
         found, switches = events.located(a.t, a.end, path, args, regime, a.switches)
@@ -325,7 +328,7 @@ def _planned(
         plan, resumes, of_landing = landing.after(
             a.t, a.end, taken.found, plan, a.landing
         )
-    judged = judge.settled(judged, a.judged, plan, resumes, taken.y1)
+    judged = judge.before_next(judged, a.judged, plan, resumes, taken.y1)
     unhealthy = health != RESULTS.successful
     result = RESULTS.where(unhealthy, health, plan.result)
     wrappers = None
@@ -343,8 +346,9 @@ def _after_gap(
 ) -> Integrated:
     """Returns the state where the next step begins, before what happens there.
 
-    Steps leave out the very times at which something happens. The motion goes on
-    meanwhile: of many known times, what is left out would add up.
+    One step ends just before a known time, the next begins just after it (see
+    `clearance`); at switches nothing is left out. The motion goes on meanwhile: of many
+    known times, what is left out would add up.
     """
     landing = scheme.landing
     if landing is None or not landing.timed:

@@ -35,7 +35,8 @@ class ScheduledTerm(diffrax.ODETerm):
     Between samples of a controller, `args.sampled` holds what it has sampled. Where a
     step begins, `sample(t, y, args)`, if any, returns it anew, and whether it changed.
 
-    `settle(t, y, args)`, if any, returns the state from which a step begins.
+    `settle(t, y, args)`, if any, returns the state from which a step begins: that after
+    the blow of joints that follow a motion, if their velocities jump there.
     """
 
     vector_field: Callable[..., PyTree] = eqx.field(static=True)
