@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_drawing import make_linkage
+from figures import make_linkage
 from test_tables import solution
 
 import fdof_jax as fj

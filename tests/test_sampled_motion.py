@@ -5,8 +5,7 @@ from functools import partial
 import diffrax
 import numpy as np
 import pytest
-from test_drawing import lines, tidy as tidy
-from test_energies import tops, values
+from figures import lines, tidy as tidy, tops, values
 from test_sampled_control import DISC
 
 import fdof_jax as fj

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 import xarray
 from chains import random_chain
-from test_drawing import make_linkage
+from figures import make_linkage
 
 import fdof_jax as fj
 

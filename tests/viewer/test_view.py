@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from elements import PLAIN
-from test_drawing import LINKAGE, SOLUTION, made_up, make_linkage, swinging
+from figures import LINKAGE, SOLUTION, made_up, make_linkage, swinging
 
 import fdof_jax as fj
 from fdof_jax import drawing

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from browser import DRIVER, PROGRAM, browser
-from test_drawing import made_up, make_linkage
+from figures import made_up, make_linkage
 from test_view import held
 
 import fdof_jax as fj

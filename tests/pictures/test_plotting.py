@@ -8,7 +8,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from chains import random_chain
-from test_drawing import (
+from figures import (
     LINKAGE,
     labels,
     lines,
@@ -17,8 +17,8 @@ from test_drawing import (
     named,
     swinging,
     tidy as tidy,
+    values,
 )
-from test_energies import values
 
 import fdof_jax as fj
 from fdof_jax import drawing, plotting

@@ -5,7 +5,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from elements import ELBOW, HOOK, TIP, WITH_INERTIA, arm
-from test_drawing import lines, named, swinging, tidy as tidy
+from figures import lines, named, swinging, tidy as tidy
 
 import fdof_jax as fj
 from fdof_jax import drawing

@@ -5,8 +5,16 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from matplotlib.axes import Axes
-from test_drawing import LINKAGE, labels, made_up, make_linkage, swinging, tidy as tidy
+from figures import (
+    LINKAGE,
+    labels,
+    made_up,
+    make_linkage,
+    swinging,
+    tidy as tidy,
+    tops,
+    values,
+)
 
 from fdof_jax import (
     JointDamper,
@@ -23,10 +31,6 @@ from fdof_jax import (
 from fdof_jax.forces import Brake, HardStops, JointFriction, JointStops, Payload
 
 
-def values(ax: Axes) -> list[np.ndarray]:
-    return [np.asarray(line.get_ydata()) for line in ax.lines]
-
-
 def test_energy_profile_adds_up():
     fig = plotting.energy_profile(make_linkage("PRR"), swinging())
     kinetic, potential, whole = fig.axes
@@ -36,15 +40,6 @@ def test_energy_profile_adds_up():
     sums = [sum(values(ax)) for ax in (kinetic, potential)]
     for total, expected in zip(values(whole), (*sums, sums[0] + sums[1])):
         np.testing.assert_allclose(total, expected, atol=1e-12)
-
-
-def tops(ax: Axes, ts) -> dict[str, np.ndarray]:
-    """Returns the upper edge of each band of a stack."""
-    edges = {}
-    for band in ax.collections:
-        x, y = band.get_paths()[0].vertices.T
-        edges[band.get_label()] = np.array([y[x == t].max() for t in ts])
-    return edges
 
 
 LIFT = make_linkage("PPR")

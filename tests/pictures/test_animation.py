@@ -5,9 +5,9 @@ import subprocess
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from figures import LINKAGE, lines, make_linkage, same, swinging, tidy as tidy
 from matplotlib.animation import writers
 from PIL import Image
-from test_drawing import LINKAGE, lines, make_linkage, same, swinging, tidy as tidy
 
 from fdof_jax import Point, SpringDamper, drawing, tip_position
 
