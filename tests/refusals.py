@@ -246,6 +246,24 @@ def refused_values(name, function, sound):
                 yield p.name, value, words
 
 
+# The fields that declare a bound of 0
+BOUNDS = {
+    "above": """DCMotor.constant DCMotor.current_limit DCMotor.gear DCMotor.resistance
+DCMotor.voltage_limit FirstOrderLag.time_constant JointFriction.speed
+JointStops.smoothing JointStops.stiffness Limits.effort SpeedLimit.no_load
+SpeedLimit.stall Travel.duration stribeck.speed""".split(),
+    "minimum": """Armature.inertia CircleTask.radius ComputedTorque.kd ComputedTorque.kp
+ComputedTorque.limit DCMotor.inductance Ellipse.sizes FigureEight.sizes
+GravityFeedforward.kd GravityFeedforward.kp GravityFeedforward.limit
+HardStops.restitution JointDamper.coefficient JointFriction.level
+JointFriction.static JointSpring.stiffness JointStops.damping
+Limits.modulus_margin Limits.overshoot Limits.settling_time
+LinearActuator.inertia LinearActuator.mass PDController.kd PDController.kp
+PDController.limit PIDController.ki Payload.inertia Payload.mass Rotor.inertia
+SpringDamper.damping SpringDamper.rest_length SpringDamper.stiffness
+Tracking.effort Tracking.effort_rate stribeck.coulomb stribeck.static""".split(),
+}
+
 # What no declaration tells: rows of how messages begin, what is changed beside sound
 # arguments, and the kind of error unless it is a ValueError
 

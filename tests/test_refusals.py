@@ -77,6 +77,18 @@ def test_wrong_values(name, refuses, searching):
     refuses(name, rows)
 
 
+@pytest.mark.parametrize("bound", refusals.BOUNDS)
+def test_bounds_are_declared(bound):
+    """The table draws its rows from declarations, and would miss none that goes."""
+    found = {
+        f"{name}.{field}"
+        for name, (function, _) in CALLABLES.items()
+        for field, about in getattr(function, "__dataclass_fields__", {}).items()
+        if about.metadata.get("rules", {}).get(bound) == 0
+    }
+    assert found == {*refusals.BOUNDS[bound]}
+
+
 @pytest.mark.parametrize(
     "name",
     [

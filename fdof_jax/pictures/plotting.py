@@ -1,8 +1,8 @@
 """Curves of motions over time and of the tip's path, with matplotlib.
 
-The curves show joint motion, energies, efforts, tracking of a task (`tip_errors`), and
-the cost of accuracy. Arguments and results are as in `drawing`, which holds the
-pictures of the linkage itself.
+The curves show joint motion, energies, efforts and tracking of a task (`tip_errors`).
+Arguments and results are as in `drawing`, which holds the pictures of the linkage
+itself.
 """
 
 from inspect import isfunction

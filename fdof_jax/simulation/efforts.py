@@ -28,6 +28,7 @@ class Efforts(NamedTuple):
     - `total`: sum over all force elements (time, n).
     - `elements`: efforts of each force element (element, time, n). The effort of a
       motor is that of its element; the total has dampers, springs and loads as well.
+      Weights of added masses, a `Payload`'s for instance, are not among them.
     """
 
     total: Float[Array, "time joint"]
