@@ -27,10 +27,11 @@ ROOMS = (
 )  # fmt: skip
 # Records check nothing, bases take nothing, the mathematics is JAX's, and `configure`
 # changes the whole process.
-LEFT_OUT = """Condition Efforts Element End Events FitResult Frames InertialElement
-Linearization Load Margins MjcfModel Modes NextMotion Part Path PointElement Reference
-Report Response Scene Solution State StatefulElement TuneResult TunedWithin Values
-accepts_scene clip configure controller_in field of_kind switch""".split()
+LEFT_OUT = """Condition Drive Efforts Element End Events FitResult Frames
+InertialElement Linearization Load Margins MjcfModel Modes NextMotion Part
+Path PointElement Reference Report Response Scene Solution State
+StatefulElement TuneResult TunedWithin Values accepts_scene clip configure
+controller_in field of_kind switch""".split()
 
 # Sound arguments
 
@@ -74,6 +75,7 @@ OWN = {
     "fit_each": dict(observed=np.zeros((1, 5, 3, 2))),
     "geometry": dict(q=ROWS),
     "step_measures": dict(change=TS, rate=np.ones(5), final=1.0),
+    "reference_of": dict(value=TASK),
     "response": dict(forces=(HELD,)),
     "sweep": dict(linkage=stacked(ARM), state0=stacked(START)),
 }
@@ -176,6 +178,7 @@ WRONG_BY_NAME = dict(
 SKIPPED = {
     "draw_linkage.color", "draw_linkage.alpha", "stacked.name", "geometry.forces",
     "save.tree", "fit.noise", "next_motion.noise", "present.t",
+    "reference_of.value",
     "step_measures.change", "step_measures.rate", "step_measures.final",
 }  # fmt: skip
 OF_ITS_OWN = {

@@ -1,11 +1,18 @@
 """Controllers, feedforward and drives."""
 
 from ..mjcf.law import Activation, Actuators
-from .drives import DCMotor, FirstOrderLag, PIDController, SpeedLimit, controller_in
+from .drives import (
+    DCMotor,
+    Drive,
+    FirstOrderLag,
+    PIDController,
+    SpeedLimit,
+    controller_in,
+)
 from .pd import ComputedTorque, GravityFeedforward, PDController, gains_from_frequency
 
 __all__ = [
-    "Activation", "Actuators", "ComputedTorque", "controller_in", "DCMotor",
+    "Activation", "Actuators", "ComputedTorque", "controller_in", "DCMotor", "Drive",
     "FirstOrderLag", "gains_from_frequency", "GravityFeedforward", "PDController",
     "PIDController", "SpeedLimit",
 ]  # fmt: skip

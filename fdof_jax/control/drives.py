@@ -88,7 +88,21 @@ class DriveState(NamedTuple):
 
 
 class Drive(StatefulElement):
-    """A drive: a subclass implements `respond`, and `initial` if it has a state."""
+    """A base for drives, which stand between a command and the effort that acts.
+
+    A subclass implements `respond`, and `initial` if it has a state.
+
+    - `command`: a force element, whose effort is the command [N or N m].
+
+    >>> import fdof_jax as fj
+    >>> class Halved(fj.control.Drive):
+    ...     def respond(self, command, qd, own):
+    ...         return command / 2, own
+    >>> drive, (arm, start, *_) = Halved(fj.JointEffort([4.0, 2, 0])), fj.scenes.fig5()
+    >>> efforts, rates = drive(0.0, *start, arm, drive.initial_state(arm))
+    >>> efforts.tolist()
+    [2.0, 1.0, 0.0]
+    """
 
     command: Callable = called("a force element, a PDController for instance")
 

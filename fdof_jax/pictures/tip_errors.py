@@ -14,7 +14,7 @@ from matplotlib.colors import ListedColormap
 
 from .. import CircleTask, Linkage, Solution, TipTask
 from ..checks import refusal, shown
-from ..references import Laps, Reference
+from ..references import Laps, Reference, reference_of
 from .arms import geometry
 from .axes import (
     SERIES,
@@ -44,8 +44,7 @@ class _Tip(NamedTuple):
 def _tip(
     linkage: Linkage, task: Reference, solution: Solution, name: str = "solution"
 ) -> _Tip:
-    tip = getattr(task, "tip", None)
-    if isinstance(task, type) or not callable(tip):
+    if not callable(task) or (tip := reference_of(task).tip) is None:
         raise refusal("task", "a CircleTask or a TipTask", task)
     ts, q, _ = reached(linkage, solution, name)
     commanded = np.asarray(jax.vmap(tip)(jnp.asarray(ts))) @ [1, 1j]

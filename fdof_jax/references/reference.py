@@ -85,7 +85,18 @@ class ForeignReference(Foreign, Reference):
 
 
 def reference_of(value: Callable) -> Reference:
-    """Returns a callable as a reference, or raises ValueError."""
+    """Returns a callable as a `Reference`, with the methods that a plain one lacks.
+
+    **Arguments:** `value`: a reference, or any callable `(t, linkage) -> (q, qd)`
+    [m or rad, and per second].
+
+    **Raises:** ValueError for anything else.
+
+    >>> import fdof_jax as fj
+    >>> still = lambda t, linkage: (0 * linkage.mass, 0 * linkage.mass)
+    >>> fj.references.reference_of(still).tip is None  # it commands joints alone
+    True
+    """
     if isinstance(value, Reference):
         return value
     if isinstance(value, Part):  # a force element or a path

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from .. import Linkage, PDController, Solution, joint_efforts
 from ..checks import check_joints, check_known, check_linkage, real_array, refusal
-from ..control import controller_in
+from ..control import Drive, controller_in
 from ..data import Report
 from ..forces import StatefulElement, elements_on
 from ..linkage import joint_names, moving_joints
@@ -183,10 +183,10 @@ def _controller(
     ((k, controller),) = found
     acts: Any = given[k]
     sampled = int(solution.acting is not None)  # the first, which then has no state
-    if k < sampled or not hasattr(acts, "command"):
+    if k < sampled or not isinstance(acts, Drive):
         return controller, efforts[k]
     state = solution.own[sum(isinstance(e, StatefulElement) for e in given[sampled:k])]
-    while hasattr(acts, "command"):
+    while isinstance(acts, Drive):
         acts, state = acts.command, state.command
     effort = lambda t, q, qd, state: acts.act(t, q, qd, linkage, state)[0]
     return controller, jax.vmap(effort)(solution.ts, solution.q, solution.qd, state)
