@@ -305,17 +305,7 @@ def _planned(
     # Tolerances are those of the state before what happens where the step begins.
     step, error = StepEnds(a.t, a.end, a.y, taken.y1, taken.args), taken.error
     if judge is None:
-        error = without_nan(error)
-        *plan, judged, result = controller.wrap(1).adapt_step_size(
-            *step, error, order, a.judged
-        )
-        plan = NextStep(*plan, result)  # pyright: ignore[reportCallIssue]
-        if landing is not None:
-            # The controller's own grid knows nothing of ends at known times.
-            dt0: Any = scheme.dt0
-            plan = plan._replace(t1=plan.t0 + dt0)
-            plan, _, of_landing = landing.after(a.t, a.end, None, plan, a.landing)
-        return plan, judged, None, of_landing
+        return _planned_without_errors(scheme, a, step, without_nan(error), order)
     if error is None:
         raise refusal(
             "solver",
@@ -339,6 +329,22 @@ def _planned(
         )
         plan = NextStep(*answer, result)  # pyright: ignore[reportCallIssue]
     return plan._replace(result=result), judged, wrappers, of_landing
+
+
+def _planned_without_errors(
+    scheme: Scheme, a: Attempt, step: StepEnds, error: PyTree, order: float
+) -> tuple[NextStep, Any, PyTree, PyTree]:
+    """Returns what `_planned` does, by a controller that judges no errors."""
+    *plan, judged, result = scheme.controller.wrap(1).adapt_step_size(
+        *step, error, order, a.judged
+    )
+    plan, of_landing = NextStep(*plan, result), None  # pyright: ignore[reportCallIssue]
+    if scheme.landing is not None:
+        # The controller's own grid knows nothing of ends at known times.
+        dt0: Any = scheme.dt0
+        plan = plan._replace(t1=plan.t0 + dt0)
+        plan, _, of_landing = scheme.landing.after(a.t, a.end, None, plan, a.landing)
+    return plan, judged, None, of_landing
 
 
 def _after_gap(
