@@ -5,6 +5,7 @@ from pathlib import Path
 
 import equinox as eqx
 import jax
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from scipy.special import ellipk
@@ -14,6 +15,7 @@ DOCS = Path(__file__).parents[1] / "docs"
 
 def run(page):
     """Runs the Python blocks of a page, with JAX's defaults; returns their names."""
+    plt.close("all")  # those of other pages
     namespace = {}
     with jax.numpy_rank_promotion("allow"):
         for block in re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL):

@@ -103,7 +103,8 @@ class Idle(fj.Element):
 def delayed(delay, gains, *others):
     feedback = lambda t, q, qd, linkage: -gains[0] * q - gains[1] * qd
     start = fj.State(jnp.ones(1), jnp.zeros(1))
-    motion = fj.simulate_sampled(DISC, start, feedback, 0.1, 60, others, delay=delay)
+    options = dict(delay=delay, throw=False)
+    motion = fj.simulate_sampled(DISC, start, feedback, 0.1, 60, others, **options)
     return motion.q[-1, 0], motion
 
 
@@ -263,7 +264,7 @@ def test_a_digital_pid_controller_and_motors():
 @pytest.mark.slow
 def test_a_failure_is_named():
     broken = lambda t, q, qd, linkage: jnp.where(t > 0.15, jnp.nan, 0.0) * q
-    motion = fj.simulate_sampled(RODS, BENT, broken, 0.1, 4)
+    motion = fj.simulate_sampled(RODS, BENT, broken, 0.1, 4, throw=False)
     assert motion.result == diffrax.RESULTS.nonfinite
     assert np.isfinite(motion.q[:2]).all() and np.isnan(motion.q[2:]).all()
 
