@@ -177,7 +177,7 @@ WRONG_BY_NAME = dict(
 # What is not checked, or by other libraries; what takes some of those by name
 SKIPPED = {
     "draw_linkage.color", "draw_linkage.alpha", "stacked.name", "geometry.forces",
-    "save.tree", "fit.noise", "next_motion.noise", "present.t",
+    "save.tree", "next_motion.noise", "present.t",
     "reference_of.value",
     "step_measures.change", "step_measures.rate", "step_measures.final",
 }  # fmt: skip

@@ -122,7 +122,7 @@ def array_of(value: Any) -> Array | np.ndarray:
 def real_numbers(
     name: str,
     value: object,
-    shape: tuple[int | str | None, ...],
+    shape: tuple[int | str | None, ...] | None,
     *,
     minimum: float | None = None,
     above: float | None = None,
@@ -140,12 +140,14 @@ def real_numbers(
     """
 
     def refuse(got: str) -> ValueError:
-        size = "x".join("n" if n in (None, JOINT) else str(n) for n in shape)
-        expected = f"an array of {size} real numbers" if shape else "a real number"
+        expected = "an array of real numbers"
+        if shape is not None:
+            size = "x".join("n" if n in (None, JOINT) else str(n) for n in shape)
+            expected = f"an array of {size} real numbers" if shape else "a real number"
         if of:
             expected += f" for {of}"
         if finite:
-            expected += ", all finite" if shape else ", finite"
+            expected += ", finite" if shape == () else ", all finite"
         if minimum is not None:
             expected += f", at least {minimum:g}"
         if above is not None:
@@ -165,6 +167,7 @@ def real_numbers(
     if array.dtype.kind not in "iuf":
         raise refuse(shown(value))
     sizes = shape_in_rows(array, rows)
+    shape = sizes if shape is None else shape
     fits = len(sizes) == len(shape) and all(
         want in (None, JOINT, have) for want, have in zip(shape, sizes)
     )
@@ -209,15 +212,16 @@ def within_bounds(
 
 
 def real_array(
-    name: str, value: object, shape: tuple[int | str | None, ...], **rules: Any
+    name: str, value: object, shape: tuple[int | str | None, ...] | None, **rules: Any
 ) -> Array:
     """Returns `value` as an array of JAX, of the default float dtype and a shape.
 
-    **Arguments:** `name`: of the argument, for messages; `shape`: `None` in it stands
-    for any length; `minimum`, `above`: lower bounds, inclusive and exclusive;
-    `finite=False` accepts infinities; `broadcast=True` accepts one number for all
-    entries, and repeats it; `unit`, for instance "m", and `of`, what the numbers are
-    of, are for messages. Known angles in "rad" that look like degrees bring a warning.
+    **Arguments:** `name`: of the argument, for messages; `shape`: `None` stands for any
+    shape, and in a shape for any length; `minimum`, `above`: lower bounds, inclusive
+    and exclusive; `finite=False` accepts infinities; `broadcast=True` accepts one
+    number for all entries, and repeats it; `unit`, for instance "m", and `of`, what the
+    numbers are of, are for messages. Known angles in "rad" that look like degrees bring
+    a warning.
 
     **Raises:** ValueError for a wrong shape, a type that is not real numbers, NaN, and
     numbers out of bounds; of traced numbers, only the shape and the type are checked.

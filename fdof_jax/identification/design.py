@@ -168,7 +168,7 @@ def next_motion(
     instance("found", found, FitResult)
     instance("start", start, Mapping)
     ts = check_times(ts)
-    noise = np.asarray(real_array("noise", noise, np.shape(noise), above=0))
+    noise = np.asarray(real_array("noise", noise, None, above=0))
     if within is not None:
         function("within", within)
     function("observe", observe)

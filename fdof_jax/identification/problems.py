@@ -11,7 +11,7 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..base.checks import function, instance, real_array, refusal, shown
+from ..base.checks import array_of, function, instance, real_array, refusal, shown
 from ..batches.stacks import stacked
 from ..mechanics.kinematics import joint_positions, tip_position
 from ..search import Evaluation, check_scene, sum_of_squares
@@ -208,10 +208,14 @@ def problems_of(
     noise: ArrayLike,
 ) -> list[Problem]:
     """Checks a scene and its recording, or lists of both, arguments of given names."""
+    numbers = "an array of real numbers"
     try:
-        readings = np.asarray(observed, dtype=jnp.result_type(float))
-    except (TypeError, ValueError) as error:
-        raise refusal(names[1], "an array of real numbers", observed) from error
+        readings = np.asarray(array_of(observed))
+    except Exception as error:  # whatever a value's own conversion raises
+        raise refusal(names[1], numbers, observed) from error
+    if readings.dtype.kind not in "iuf":
+        raise refusal(names[1], numbers, observed)
+    readings = readings.astype(jnp.result_type(float))
     if np.isinf(readings).any():
         raise ValueError(f"{names[1]}: expected finite readings or NaN, got infinity.")
     if not isinstance(scene_at, list | tuple):
@@ -227,7 +231,7 @@ def problems_of(
             f"{names[1]}: expected a row for each of the {ts.size} times, got shape "
             f"{shape}."
         )
-    noise = np.asarray(real_array("noise", noise, np.shape(noise), above=0))
+    noise = np.asarray(real_array("noise", noise, None, above=0))
     try:
         weights = np.broadcast_to(1 / noise, shape)
     except ValueError:
