@@ -33,6 +33,10 @@ def main() -> None:
         "--quick fdof-output/benchmarks",
     )  # fmt: skip
     parser.add_argument(
+        "--beside", metavar="PYTHON",
+        help="another environment, whose first results stand beside this one's",
+    )  # fmt: skip
+    parser.add_argument(
         "--render", action="store_true", help="measure nothing, draw what is there"
     )
     options = parser.parse_args()
@@ -47,15 +51,18 @@ def main() -> None:
         if not (job.name in names if names else job.cpu):
             continue
         began = time.perf_counter()
-        command = [sys.executable, "-m", "benchmarks.worker", job.name]
-        command.append(str((output / f"{job.name}.jsonl").resolve()))
-        command += ["--quick"] * options.quick
-        with tempfile.TemporaryDirectory() as cache:
-            # heyoka would take its programs from those of an earlier run.
-            env = {**os.environ, "XDG_CACHE_HOME": cache}
-            done = subprocess.run(command, cwd=FOLDER.parent, env=env, check=False)
-        if done.returncode:
-            failed.append(job.name)
+        file = (output / f"{job.name}.jsonl").resolve()
+        file.unlink(missing_ok=True)
+        beside = [options.beside] * bool(options.beside and job.name == "compile_times")
+        for python in (sys.executable, *beside):
+            command = [python, "-m", "benchmarks.worker", job.name, str(file)]
+            command += ["--quick"] * options.quick
+            with tempfile.TemporaryDirectory() as cache:
+                # heyoka would take its programs from those of an earlier run.
+                env = {**os.environ, "XDG_CACHE_HOME": cache}
+                done = subprocess.run(command, cwd=FOLDER.parent, env=env, check=False)
+            if done.returncode:
+                failed.append(job.name)
         print(f"{job.name}: {time.perf_counter() - began:.0f} s", flush=True)
     points = load(output)
     if output.resolve() == RESULTS.resolve() and not names:

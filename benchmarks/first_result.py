@@ -22,6 +22,21 @@ import fdof_jax as fj
 TS = np.linspace(0, 2, 201)
 
 
+def pendulum() -> Callable:
+    """Returns a textbook's pendulum in plain diffrax: a unit for slow machines."""
+    term = diffrax.ODETerm(lambda t, y, args: jnp.stack([y[1], -9.81 * jnp.sin(y[0])]))
+    control = diffrax.PIDController(rtol=1e-11, atol=1e-11)
+
+    @jax.jit
+    def run(ts):
+        return diffrax.diffeqsolve(
+            term, diffrax.Dopri8(), ts[0], ts[-1], 1e-3, jnp.array([1.0, 0.0]),
+            saveat=diffrax.SaveAt(ts=ts), stepsize_controller=control,
+        ).ys  # fmt: skip
+
+    return lambda scale: run(scale * TS)
+
+
 def _simulate(scene: fj.Scene) -> Callable:
     linkage, state0, forces, _ = scene
     return lambda scale: fj.simulate(linkage, state0, scale * TS, forces)
@@ -87,6 +102,7 @@ def tune() -> Callable:
 
 
 CASES: dict[str, Callable] = {
+    "a pendulum in plain diffrax": pendulum,
     "Fig 5": fig5,
     "Fig 7": fig7,
     "friction, stops and a payload": held,

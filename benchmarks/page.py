@@ -239,18 +239,31 @@ def hard_cases(points: Points) -> str:
 
 
 def compile_times(points: Points) -> str:
-    rows = []
+    """Each cell has a number for each version of JAX."""
+    versions = list(dict.fromkeys(p["versions"]["jax"] for p in points))
+    rows, units = [], []
     for case in dict.fromkeys(p["problem"] for p in points):
-        new, kept = (
-            chosen(points, problem=case, solver=how)[0]
-            for how in ("new", "programs kept")
-        )
-        call = new["time_median"] - new["imported"]
-        again = number(1e3 * new["again"])
-        first, later = number(new["time_median"]), number(kept["time_median"])
-        rows.append([case, first, number(call), later, again])
-    head = ["", "process [s]", "first call [s]", "process, programs kept [s]"]
-    return table([*head, "second call [ms]"], rows)
+        cells = []
+        for k, version in enumerate(versions):
+            new, kept = (
+                next(
+                    p
+                    for p in chosen(points, problem=case, solver=how)
+                    if p["versions"]["jax"] == version
+                )
+                for how in ("new", "programs kept")
+            )
+            call = new["time_median"] - new["imported"]
+            if not rows:
+                units.append(call)  # the first case is the pendulum
+            cells.append(
+                [new["time_median"], call, call / units[k], kept["time_median"]]
+                + [1e3 * new["again"]]
+            )
+        rows.append([case, *(" / ".join(map(number, pair)) for pair in zip(*cells))])
+    head = ["JAX " + " / ".join(versions), "process [s]", "first call [s]"]
+    head += ["over the pendulum's", "process, programs kept [s]", "second call [ms]"]
+    return table(head, rows)
 
 
 def gpu(points: Points) -> str:

@@ -52,7 +52,7 @@ def _plain(value: Any) -> Any:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("job", choices=[job.name for job in JOBS])
-    parser.add_argument("output", type=Path, help="JSON lines")
+    parser.add_argument("output", type=Path, help="JSON lines, to which this adds")
     parser.add_argument("--quick", action="store_true")
     options = parser.parse_args()
     job = next(job for job in JOBS if job.name == options.job)
@@ -74,7 +74,7 @@ def main() -> None:
         module = importlib.import_module(f"benchmarks.{job.module or job.name}")
         points = getattr(module, job.function)(options.quick)
     options.output.parent.mkdir(parents=True, exist_ok=True)
-    with options.output.open("w") as file:
+    with options.output.open("a") as file:
         for point in points:
             point = {"job": job.name, **point}
             file.write(json.dumps(_plain(point), allow_nan=False) + "\n")
