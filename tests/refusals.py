@@ -351,6 +351,11 @@ TWO, TWO_STARTS, SEEN = stacked(ARM), stacked(START), np.zeros((5, 3, 2))
 SHARED = "linkage, state0, forces"
 BARE = fj.Scene(ARM, START, (), 1.0)
 MORE = {
+    "step_measures": [
+        (rf"{name}: expected real numbers of shape", {name: value})
+        for name in ("change", "rate", "final")
+        for value in (np.zeros(2), "1", np.ones(5, complex))
+    ],
     "Linkage": [
         ("length: .* 4 real numbers for the ground and 3 moving", dict(length=ONES)),
         ("com: .* 3x2 real numbers for 3 moving links", dict(com=ONES)),
