@@ -316,7 +316,7 @@ def sum_of_squares(found: Sensitivities, **facts: Array) -> Evaluation:
 
 @eqx.filter_jit(compiler_options=options_of_loops())  # pyright: ignore[reportCallIssue]
 def _evaluate(
-    evaluate: Evaluate, z: Array, moving: PyTree, shared: PyTree
+    evaluate: Evaluate, z: Array | np.ndarray, moving: PyTree, shared: PyTree
 ) -> Evaluation:
     """Evaluates lanes, along the leading axis of `z` and `moving`."""
 
@@ -366,8 +366,8 @@ class Lanes:
 
         def evaluated(lanes: np.ndarray) -> Evaluation:
             there = run[lanes], member[lanes]
-            moving = jax.tree.map(lambda a: jnp.asarray(a[there]), self.moving)
-            here = jnp.asarray(points[lanes])
+            moving = jax.tree.map(lambda a: a[there], self.moving)
+            here = points[lanes]
             evaluate = lambda shared: _evaluate(self.evaluate, here, moving, shared)
             found = sharing_functions(evaluate, problem=self.shared)
             return jax.tree.map(np.asarray, found)

@@ -31,8 +31,9 @@ def check_angles(name: str, values: ArrayLike, ef: ArrayLike) -> None:
         radians(name, np.where(real_joints(np.asarray(ef)), values, 0))
 
 
-def fixed_pairs(ef: Array | np.ndarray) -> tuple[Array, ...]:
+def fixed_pairs(ef: Array | np.ndarray) -> tuple[Any, ...]:
     """Returns whether both joints of each pair are fictitious, so that it is fixed."""
+    ef = ef if is_traced(ef) else np.asarray(ef)  # whose entries cost no calls of JAX
     return tuple(ef[k - 1] + ef[k] < 0.5 for k in range(1, len(ef), 2))
 
 

@@ -20,7 +20,7 @@ from ..mechanics.kinematics import tip_position
 from ..references.reference import reference_motion, reference_of
 from ..references.task import TipReference
 from ..search import Evaluation, check_scene, sum_of_squares
-from ..simulation.jacobian import Sensitivities, jacobian_of
+from ..simulation.jacobian import TOLERANCE, Sensitivities, jacobian_of
 from ..simulation.scene import Scene
 from ..simulation.solution import Solution, check_joints
 
@@ -244,12 +244,15 @@ class GainBox(NamedTuple):
         return np.clip(gains, self.lower, self.upper)
 
 
-def gain_jacobian(z: Array, scene: Scene, loss: Loss) -> Sensitivities:
+def gain_jacobian(
+    z: Array, scene: Scene, loss: Loss, tolerance: float = TOLERANCE
+) -> Sensitivities:
     """Residuals of a loss and their derivatives in the logarithms of factors `z`."""
     gains = gains_of(scene)
     scene_at = lambda z: with_gains(scene, gains * jnp.exp(z).reshape(gains.shape))
     residuals = lambda scene, solution: residuals_of(loss, scene, solution)
-    return jacobian_of(scene_at, residuals, z, jnp.linspace(0, scene.t1, SAMPLES))
+    ts = jnp.linspace(0, scene.t1, SAMPLES)
+    return jacobian_of(scene_at, residuals, z, ts, tolerance)
 
 
 def residuals_of(loss: Loss, scene: Scene, solution: Solution) -> Array:

@@ -83,7 +83,7 @@ def tune(
     """Minimises a scene's loss in the gains of its PD controller, within bounds.
 
     The unknowns are the logarithms of kp and kd; gains of zero stay zero. Derivatives
-    are tangents of the motion, whose steps have a tolerance of 1e-6. The relative error
+    are tangents of the motion, whose steps have a tolerance of 1e-5. The relative error
     of derivatives is about 1e-6, or some 1e-4 if actuators are at their limits for
     long. A second call with other numbers, another topology or another method compiles
     nothing; a call with a loss function of other code does.

@@ -58,7 +58,8 @@ _WITHIN = 5e-4
 # Price of the greatest excess, as a share of the loss at the start. The search exceeds
 # no limit that it can meet, as long as the multipliers of all limits sum to less.
 _PRICE = 100.0
-_ENOUGH = 1e-6  # relative decrease of the loss at which the search ends
+# Relative decrease of the loss at which the search ends, and tolerance of its motions.
+_ENOUGH, _TOLERANCE = 1e-6, 1e-7
 # The unknowns are scaled to equal curvatures of the loss, at least this share of it.
 _FLAT = 1e-2
 _FAILED = 1e6  # loss and excess where the simulation fails
@@ -225,7 +226,7 @@ def _lane(z: Array, problem: tuple[Scene, Loss, Limits, bool]) -> Evaluation:
         beyond = excess(limits, scene, solution, with_margins)
         return jnp.concatenate([beyond, residuals_of(loss, scene, solution)])
 
-    found = gain_jacobian(z, scene, residuals)
+    found = gain_jacobian(z, scene, residuals, _TOLERANCE)
     count = joints_of(scene.linkage) * (3 * _SPANS + with_margins * _BANDS)
     beyond, errors = jnp.split(found.residuals, [count])
     slopes, jacobian = jnp.split(found.jacobian, [count])
