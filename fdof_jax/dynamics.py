@@ -26,7 +26,7 @@ def forward_dynamics(
     """Computes joint accelerations under joint efforts: (14), reduced.
 
     They equal those of the paper's masked equations (17)-(27), which are singular in
-    some more cases, such as a massless revolute tip.
+    more cases, such as a massless revolute tip.
 
     **Arguments:** `q` [m or rad], `qd` [m/s or rad/s], `tau` [N or N m]; `forces`:
     elements, of which only masses count. Include their efforts in `tau`.

@@ -49,8 +49,8 @@ class Armature(InertialElement):
 class Rotor(InertialElement):
     """Rotors of motors, carried by the links before their joints: exact coupling.
 
-    A rotor's axis is perpendicular to the plane. It turns at the rate of the link
-    before the joint plus gear * qd; its mass belongs to that link. From gear ratios of
+    A rotor turns about an axis perpendicular to the plane, at the rate of the link
+    before the joint plus gear * qd. Its mass belongs to that link. From gear ratios of
     50 on, an `Armature` of gear^2 * inertia is as good.
 
     **Arguments:** one per joint or one for all; fixed pairs have no rotor.

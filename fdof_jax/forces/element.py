@@ -30,7 +30,7 @@ class Element(Part):
 
     - `conditions`: yields conditions on values, besides the bounds that `field`
       declares; `conditions_on(linkage)`: those on the arm's joints.
-    - `jump_ts`: one or several times at which the efforts jump; steps end there [s]. By
+    - `jump_ts`: one or several times [s] at which the efforts jump; steps end there. By
       default, the jumps of its fields.
     - `check(linkage, ts)`: raises ValueError if the element does not fit the arm;
       `simulate` calls it after a failed motion.
@@ -100,7 +100,6 @@ class _Opened(ForeignElement):
 
 
 def element_of(value: Callable) -> Element:
-    """Returns a callable as an element."""
     return value if isinstance(value, Element) else ForeignElement(value)
 
 
@@ -209,7 +208,7 @@ class InertialElement(Element):
     """
 
     def at(self, t: Array | np.ndarray) -> "InertialElement":
-        """Returns the element with the masses of a time, or itself if constant."""
+        """Returns an element with the masses of a time; itself if they never change."""
         return self
 
     @abstractmethod

@@ -83,9 +83,9 @@ class JointFriction(Holder):
 
     `level` and `static` may have two rows (2, n), for the positive and the negative
     direction. Each may be a function `(t, q, qd, linkage)` that returns such numbers,
-    positive and smooth in each direction, such as `stribeck`; its attribute `jump_ts`
-    lists times at which it jumps. Its value at qd = 0 holds joints at rest. Negative
-    values, and static friction below the level, end a motion as not finite.
+    positive and smooth in each direction, such as `stribeck`. The value at qd = 0 holds
+    joints at rest; an attribute `jump_ts` lists times at which the function jumps.
+    Negative values, and static friction below the level, end a motion as not finite.
     `Solution.taken` does not count a level that is a function.
 
     **Raises:** ValueError for malformed arguments, and for `static` beside `speed`.

@@ -127,10 +127,9 @@ def work(
 class PointElement(ScalarElement):
     """A force element that acts on points of links or of the ground.
 
-    A subclass implements `loads` [N and N m], which `joint_reactions` includes. From
-    its argument `frames`, `point.place(frames)` is a point's position and
-    `point.velocity(frames, qd)` its velocity, as complex numbers x + iy [m, m/s].
-    Forces may be complex, too.
+    A subclass implements `loads` [N and N m], which `joint_reactions` includes. In it,
+    `point.place(frames)` is a point's position and `point.velocity(frames, qd)` its
+    velocity, as complex numbers x + iy [m, m/s]. Forces may be complex, too.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage

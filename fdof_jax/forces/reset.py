@@ -24,9 +24,9 @@ class Reset(Element):
 
     After a jump `when` may still be 0; the next one comes when it passes 0 again. A
     start on 0 does not count. Where an impact, a payload or another reset carries
-    `when` over 0, the state jumps at once. Ever faster jumps end the motion ("too many
-    switches"); for rest, use `HardStops`. A new state that is not finite, or beyond a
-    hard stop, ends it too ("not finite").
+    `when` over 0, the state jumps at once. Jumps that follow ever faster end the motion
+    ("too many switches"); `HardStops` hold what comes to rest. A new state that is not
+    finite, or beyond a hard stop, ends it too ("not finite").
 
     **Arguments:**
 

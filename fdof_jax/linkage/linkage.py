@@ -55,8 +55,8 @@ class Linkage(Frozen):
     - `gravity`: acceleration along -y [m/s^2].
 
     **Raises:** ValueError for malformed arguments, and if a joint moves no inertia in
-    any configuration. Warns if the mass matrix may be singular in some configuration,
-    and of redundant joints (the paper's rules (i) and (ii)).
+    any configuration. Warns if the mass matrix may be singular in some, and of
+    redundant joints (the paper's rules (i) and (ii)).
 
     >>> import fdof_jax as fj
     >>> pendulum = fj.Linkage("RRR", length=[0, 1, 1, 1], com=[[1, 0]] * 3,

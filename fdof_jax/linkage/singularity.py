@@ -81,9 +81,9 @@ def check_singularity(linkage: Numbers) -> None:
                 line = " along the same line" if alike else ""
                 raise ValueError(
                     f"mass, inertia, com: expected joints {joints} of {names} to move "
-                    "some inertia however they move together, got joints that can move "
-                    f"against each other{line} and move none, in any configuration: "
-                    "their accelerations are undetermined."
+                    "some inertia whenever they move, got joints that can move against "
+                    f"each other{line} and move none, in any configuration: their "
+                    "accelerations are undetermined."
                 )
             raise ValueError(
                 f"mass, inertia, com: expected joint {k + 1} ({kind}) of {names} to "

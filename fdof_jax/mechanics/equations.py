@@ -238,7 +238,7 @@ def equations(
     # While all joints keep their rates: accelerations of the links' starts, from the
     # base outwards, upwards by gravity. A joint's rate adds w_k^2 - w_(k-1)^2 to the
     # angular velocity squared, or half of it as the Coriolis acceleration of a slide.
-    # As products with joint rates, nearly equal squares do not cancel.
+    # Differences of nearly equal squares would cancel; these products do not.
     gained = [None, *(qd[k] * (w[k - 1] + w[k]) for k in joints[1:])]
     coriolis = [None, *(where(r[k], zero, gained[k]) for k in joints[1:])]
     start = [(jnp.zeros_like(c.gravity), c.gravity)]

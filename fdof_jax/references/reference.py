@@ -25,7 +25,7 @@ class Reference(Part):
 
     - `assembly(t, linkage)`: positions, and a root that is 0 at the edge of the reach.
       The velocities are then the exact rates of the positions.
-    - `jump_ts`: one or several times at which the motion jumps; steps end there [s].
+    - `jump_ts`: one or several times [s] at which the motion jumps; steps end there.
     - `check(linkage, ts)`: raises ValueError if the arm cannot follow.
     - `tip(t)`: the commanded position of the tip (2,) [m]; by default None.
     - `period`: the time of one turn [s]; by default None.
@@ -129,8 +129,8 @@ def reachable(
 ) -> Bool[Array, " time"]:
     """Returns whether a linkage can reach the reference at each time.
 
-    A `TipTask` is out of reach at all times if it passes behind the pivot between the
-    first and the last, because joints would jump there.
+    A `TipTask` that passes behind the pivot between the first and the last time is out
+    of reach at all times: joints would jump there.
 
     **Arguments:** `linkage`; `reference`: such as a `TipTask`; `ts`: times (time,) [s].
 

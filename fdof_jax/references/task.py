@@ -52,7 +52,7 @@ class JointMove(Reference):
     travel: Travel = of_kind(Travel)
 
     def assembly(self, t: Array, linkage: Linkage) -> tuple[Array, float]:
-        """Returns positions, and 1: a joint move has no edge of the reach."""
+        """Returns positions, and 1: the reach has no edge."""
         return self.start + self.travel(t) * (self.end - self.start), 1.0
 
 
@@ -97,9 +97,9 @@ class TipReference(Reference):
 
     @abstractmethod
     def wrist_seen(self, t: Array, base: Array) -> tuple[Array, Array]:
-        """Returns the wrist x + iy from the first joint, and its angle over all turns.
+        """Returns the vector x + iy from the first joint to the wrist, and its angle.
 
-        `base`: the rest of the vector to the tip.
+        The angle is continuous in time. `base`: the rest of the vector to the tip.
         """
 
     def assembly(self, t, linkage):
@@ -115,8 +115,8 @@ class TipReference(Reference):
     ) -> tuple[Float[Array, " joint"], Float[Array, " joint"]]:
         """Returns positions and velocities at time `t` [s].
 
-        Out of reach, known arguments raise ValueError, and traced ones return NaN. At
-        the edge of the reach velocities are not finite.
+        Out of reach, known arguments raise ValueError and traced ones return NaN.
+        Velocities are not finite at the edge.
         """
         motion = super().__call__(t, linkage)
         if not (is_traced(motion) or np.isfinite(motion).all()):
