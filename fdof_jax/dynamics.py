@@ -25,8 +25,8 @@ def forward_dynamics(
 ) -> Float[Array, " joint"]:
     """Computes joint accelerations under joint efforts: (14), reduced.
 
-    The result equals that of the paper's masked equations (17)-(27). It is regular in
-    some cases where those are singular, such as a massless revolute tip.
+    They equal those of the paper's masked equations (17)-(27), which are singular in
+    more cases, such as a massless revolute tip.
 
     **Arguments:** `q` [m or rad], `qd` [m/s or rad/s], `tau` [N or N m]; `forces`:
     elements, of which only masses count. Include their efforts in `tau`.
@@ -50,14 +50,12 @@ def inertia_ratios(
 ) -> Float[Array, " joint"]:
     """Computes how well each joint's acceleration is determined, in (0, 1].
 
-    The ratio 1 / (M_kk (M^-1)_kk) of the joint mass matrix has no unit. It is the
-    inertia [kg or kg m^2] of a joint with the others free to move, over its inertia
-    with the others locked. The accelerations lose about -log10 of the least ratio in
-    digits. Below 1e-11 in float64 or 1e-5 in float32, `simulate` stops and reports it.
-    The ratio is zero where the matrix is not positive definite, and infinite at fixed
-    pairs.
+    The ratio 1 / (M_kk (M^-1)_kk) is the inertia of a joint with the others free, over
+    that with the others locked. Accelerations lose about -log10 of the least ratio in
+    digits; `simulate` stops below 1e-11, in float32 below 1e-5. The ratio is zero where
+    the mass matrix is not positive definite, and infinite at fixed pairs.
 
-    **Arguments:** `q` [m or rad]; `forces`: elements, of which those with masses count.
+    **Arguments:** `q` [m or rad]; `forces`: elements, of which only masses count.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
@@ -79,7 +77,7 @@ def inverse_dynamics(
     """Computes joint efforts for given joint accelerations, from (14) reduced.
 
     **Arguments:** `q` [m or rad], `qd` [m/s or rad/s], `qdd` [m/s^2 or rad/s^2];
-    `forces`: elements, of which those with masses count.
+    `forces`: elements, of which only masses count.
 
     **Returns:** `tau` [N or N m], the sum of the efforts of all elements.
 
@@ -96,14 +94,14 @@ def inverse_dynamics(
 def mass_matrix(
     linkage: Linkage, q: Float[Array, " joint"], forces: Forces = ()
 ) -> Float[Array, "joint joint"]:
-    """Computes the mass matrix M in joint coordinates, in M qdd + bias = tau.
+    """Computes the joint mass matrix M, in M qdd + bias = tau.
 
     M is (8)-(13) projected on the real joints: symmetric, and positive definite unless
     the arm is singular.
 
-    **Arguments:** `q` [m or rad]; `forces`: elements, of which those with masses count.
+    **Arguments:** `q` [m or rad]; `forces`: elements, of which only masses count.
 
-    **Returns:** M [kg, kg m or kg m^2].
+    **Returns:** M (n, n) [kg, kg m or kg m^2]; at fixed pairs, rows of the identity.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
@@ -125,11 +123,10 @@ def bias_force(
 ) -> Float[Array, " joint"]:
     """Computes the bias: gravity, centrifugal and Coriolis forces on the joints.
 
-    In M qdd + bias = tau, the bias is the effort at zero acceleration. It is minus phi
-    of (14), projected on the real joints.
+    In M qdd + bias = tau, it is minus phi of (14), projected on the real joints.
 
     **Arguments:** `q` [m or rad], `qd` [m/s or rad/s]; `forces`: elements, of which
-    those with masses count. The efforts of springs and others belong to tau.
+    only masses count.
 
     **Returns:** the bias [N or N m].
 
@@ -148,7 +145,7 @@ def mass_and_bias(
     qd: Array,
     start: tuple[Array, Constants] | None = None,
 ) -> tuple[Array, Array]:
-    """Computes mass matrix and bias of the linkage and of elements that add masses.
+    """Computes the mass matrix and the bias, with the masses of elements.
 
     `start`: joint positions and the constants of the equations there, if known.
     """
@@ -172,7 +169,8 @@ def link_energies(
 
     **Arguments:** `q` [m or rad], `qd` [m/s or rad/s].
 
-    **Returns:** two arrays [J]; the potential is zero at the ground pivot's height.
+    **Returns:** two arrays (n,) [J]; the potential is zero at the ground pivot's
+    height.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
@@ -195,8 +193,8 @@ def energy(
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Computes the kinetic and potential energy of the linkage, (6) and (7).
 
-    **Arguments:** `q` [m or rad], `qd` [m/s or rad/s]; `forces`: force elements.
-    Masses, springs, stops and constant tensions add energy.
+    **Arguments:** `q` [m or rad], `qd` [m/s or rad/s]; `forces`: elements, of which
+    masses, springs, stops and constant tensions add energy.
 
     **Returns:** two numbers [J]; the potential is zero at the ground pivot's height.
 

@@ -1,7 +1,6 @@
 """Checks of the arguments of public functions.
 
-Shapes and types are always checked, values only where they are concrete: a value traced
-by `jax.jit`, `jax.vmap` or `jax.grad` is not known yet.
+Shapes and types are always checked, values only while JAX does not trace them.
 """
 
 import importlib
@@ -38,15 +37,13 @@ def is_traced(*trees: PyTree) -> bool:
 
 
 def transformation() -> object:
-    """Returns what tells the running JAX transformation from others and from none."""
+    """Returns a value that identifies the running JAX transformation."""
     return get_opaque_trace_state(convention="nnx")
 
 
 def is_transformed() -> bool:
-    """Returns whether a JAX transformation is running, whatever it traces.
-
-    Functions may then hold traced values in their closures, where none can be found.
-    """
+    """Returns whether a JAX transformation is running, whatever it traces."""
+    # Closures may hold traced values, which no check can find.
     with eval_context():
         outside = transformation()
     return transformation() != outside
@@ -85,7 +82,7 @@ def plain(text: str) -> str:
 
 
 def shown(value: object) -> str:
-    """Returns how messages show a value that was given; its type, if that fails."""
+    """Returns the text of a value for messages; if that fails, its type."""
     try:
         return plain(repr(_beginning(value)))
     except Exception:  # whatever a value's own text raises, as a deleted array's does
@@ -93,7 +90,7 @@ def shown(value: object) -> str:
 
 
 def _beginning(value: Any) -> Any:
-    """Returns what messages may show of it: the text of a million numbers is slow."""
+    """Returns the beginning of a value: the text of a million numbers is slow."""
     if isinstance(value, tuple):  # also a NamedTuple
         return tuple.__new__(type(value), map(_beginning, value[:_MOST_SHOWN]))
     if type(value) is list:
@@ -110,9 +107,9 @@ def refusal(name: str, expected: str, got: object) -> ValueError:
 
 
 def array_of(value: Any) -> Array | np.ndarray:
-    """Returns a value as NumPy's array, or JAX's if it is traced.
+    """Returns a value as an array of NumPy, or of JAX if it is traced.
 
-    Raises TypeError for a masked one, whose mask this would drop.
+    Raises TypeError for a masked array, whose mask would be lost.
     """
     if isinstance(value, np.ma.MaskedArray):
         raise TypeError("masked arrays are not supported")
@@ -132,11 +129,10 @@ def real_numbers(
     unit: str = "",
     of: str = "",
 ) -> Array | np.ndarray:
-    """Returns numbers as `real_array` does, but in NumPy, none that the caller has.
+    """Returns numbers as `real_array` does, but as a new array of NumPy.
 
-    They are in JAX if `value` is traced or is an array of JAX of that dtype and shape
-    already. JOINT in `shape` stands for the length of any arm. `rows` also accepts so
-    many rows of that shape.
+    Traced values, and an array of JAX that fits already, stay in JAX. JOINT in `shape`
+    stands for any number of joints. So many `rows` of it are accepted too.
     """
 
     def refuse(got: str) -> ValueError:
@@ -194,7 +190,7 @@ def real_numbers(
 
 
 def shape_in_rows(value: Any, rows: int | None) -> tuple[int, ...]:
-    """Returns the shape of an array, or of each of its `rows`, if it has so many."""
+    """Returns the shape of an array, or of each of its `rows` if it has so many."""
     shape = np.shape(value)
     return shape[1:] if len(shape) == 2 and shape[0] == rows else shape
 
@@ -202,7 +198,7 @@ def shape_in_rows(value: Any, rows: int | None) -> tuple[int, ...]:
 def within_bounds(
     values: Any, minimum: float | None, above: float | None, finite: bool, **_: Any
 ) -> Array:
-    """Returns whether numbers fulfil the rules on values, also if they are traced."""
+    """Returns whether numbers, known or traced, are within bounds."""
     holds = abs(values) < np.inf if finite else values == values
     if minimum is not None:
         holds = holds & (values >= minimum)
@@ -214,17 +210,17 @@ def within_bounds(
 def real_array(
     name: str, value: object, shape: tuple[int | str | None, ...] | None, **rules: Any
 ) -> Array:
-    """Returns `value` as an array of JAX, of the default float dtype and a shape.
+    """Returns `value` as an array of JAX of the default float dtype.
 
-    **Arguments:** `name`: of the argument, for messages; `shape`: `None` stands for any
-    shape, and in a shape for any length; `minimum`, `above`: lower bounds, inclusive
-    and exclusive; `finite=False` accepts infinities; `broadcast=True` accepts one
-    number for all entries, and repeats it; `unit`, for instance "m", and `of`, what the
-    numbers are of, are for messages. Known angles in "rad" that look like degrees bring
-    a warning.
+    **Arguments:** `name`: the argument's name, for messages; `shape`: None means any
+    shape, and within a shape any length; `minimum`, `above`: lower bounds, inclusive
+    and exclusive; `finite=False` accepts infinities; `broadcast=True` repeats one
+    number for all entries; `unit`, such as "m", and `of`, what the numbers belong to,
+    are for messages.
 
-    **Raises:** ValueError for a wrong shape, a type that is not real numbers, NaN, and
-    numbers out of bounds; of traced numbers, only the shape and the type are checked.
+    **Raises:** ValueError for a wrong shape or type, NaN, and numbers out of bounds. Of
+    traced numbers only shape and type are checked. Warns of known angles in "rad" that
+    look like degrees.
     """
     numbers = real_numbers(name, value, shape, **rules)
     if isinstance(numbers, Array):
@@ -264,7 +260,7 @@ def increasing(name: str, times: Array | np.ndarray) -> None:
 
 
 def place_of(item: object, items: Sequence[object]) -> int:
-    """Returns the index of the very object `item`; arrays need not compare equal."""
+    """Returns the index of the object `item` itself; arrays need not compare equal."""
     return [other is item for other in items].index(True)
 
 
@@ -276,7 +272,7 @@ def function(name: str, value: object, expected: str = "a callable") -> Callable
 
 
 def hashable(name: str, functions: PyTree) -> None:
-    """Raises ValueError if a function, or what one holds beside arrays, has no hash."""
+    """Raises ValueError if a leaf other than an array has no hash."""
     for leaf in jax.tree.leaves(functions):
         if eqx.is_array_like(leaf):
             continue
@@ -295,9 +291,9 @@ def instance(name: str, value: object, kind: type) -> None:
 
 
 def whole_number(name: str, value: Any, minimum: int, most: int | None = None) -> int:
-    """Returns an integer from `minimum` to `most`, also one in an array without axes.
+    """Returns an integer from `minimum` to `most`, also from an array without axes.
 
-    Raises ValueError for all else, bools too.
+    **Raises:** ValueError for all else, bools too.
     """
     try:
         number = None if isinstance(value, bool) else operator.index(value)

@@ -1,4 +1,4 @@
-"""Settings that an application makes once, at its start, with `configure`.
+"""Settings that an application makes once, at its start.
 
 Importing the library sets nothing.
 """
@@ -44,10 +44,7 @@ def options_of_loops() -> dict[str, bool]:
 
 @functools.cache
 def wide_vectors() -> dict[str, Any]:
-    """Returns compiler options of `jax.jit` for wide vectors.
-
-    Returns none where XLA does not know the option, or does not compile for a CPU.
-    """
+    """Returns options of `jax.jit` for wide vectors; none unless XLA on CPU has any."""
     if jax.default_backend() != "cpu":
         return {}
     try:
@@ -62,22 +59,21 @@ def configure(
 ) -> None:
     """Sets up JAX for an application; call it once, before anything is computed.
 
-    `configure` always makes XLA compile small loops as one kernel; JAX before 0.12
-    needs an option for this. Single arms are then simulated up to four times as fast,
-    and gradients take a third of the time.
+    Before JAX 0.12, `configure` also sets an option of XLA that makes single arms up to
+    four times as fast, and their gradients three times.
 
     **Arguments:** None leaves a setting as it is.
 
     - `x64`: whether numbers have double precision. Existing arms and elements keep
       their precision; `simulate` warns of them.
-    - `cache`: a folder that keeps compiled programs for later processes; True for a
-      folder in the user's cache directory, False for no folder. Each kind of processor
-      has its own subfolder. Programs are deleted only if
-      `jax_compilation_cache_max_size` is set. JAX keeps no program that calls Python,
-      such as your `jax.jit` of `simulate` unless it has `throw=False`.
+    - `cache`: a folder that keeps compiled programs for later processes; True for one
+      in the user's cache directory, False for none. Each kind of processor has a
+      subfolder. Programs are deleted only if `jax_compilation_cache_max_size` is set.
+      JAX keeps no program that calls Python, as `simulate` in your `jax.jit` does
+      without `throw=False`.
 
     **Raises:** ValueError for malformed arguments and for a folder that cannot be
-    written. Warns if the option comes too late, because JAX has started.
+    written. Warns if the option cannot be set, such as after JAX has started.
 
     >>> import fdof_jax as fj
     >>> fj.configure(x64=True)
@@ -132,7 +128,7 @@ def _user_cache() -> Path:
 
 
 def _processor() -> str:
-    """Names this kind of processor, as compiled programs run on no other kind."""
+    """Names this kind of processor: compiled programs run on no other."""
     facts = [platform.machine(), platform.processor()]
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():  # on Linux

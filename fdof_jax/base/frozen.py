@@ -1,4 +1,4 @@
-"""Modules that do not change, and return changed copies."""
+"""Immutable modules that return changed copies."""
 
 import inspect
 from dataclasses import FrozenInstanceError
@@ -10,7 +10,7 @@ from .checks import plain
 
 
 class Frozen(eqx.Module):
-    """A module with a checked `replace`, which refused assignments name."""
+    """An immutable module with a checked `replace`."""
 
     def __init_subclass__(cls, **keywords: Any):
         super().__init_subclass__(**keywords)
@@ -27,10 +27,9 @@ class Frozen(eqx.Module):
             ) from None
 
     def arguments(self) -> dict[str, Any]:
-        """Returns arguments of the constructor that make an equal one.
+        """Returns the arguments of the constructor as a dictionary.
 
-        A class with a constructor of its own overrides it, unless each argument has a
-        field of its name.
+        A class overrides it if an argument has no field of its name.
         """
         fields, names = vars(self), inspect.signature(type(self)).parameters
         if missing := [name for name in names if name not in fields]:
@@ -41,13 +40,11 @@ class Frozen(eqx.Module):
         return {name: fields[name] for name in names}
 
     def replace(self, **values: Any) -> Self:
-        """Returns a copy with other values of some arguments, checked as a new one.
+        """Returns a checked copy with other values of some constructor arguments.
 
         From Python 3.13 on `copy.replace` does the same.
 
-        **Arguments:** those of the constructor.
-
-        **Raises:** ValueError for malformed values and for unknown names.
+        **Raises:** ValueError for malformed values and unknown names.
 
         >>> import fdof_jax as fj
         >>> fj.scenes.fig5().linkage.replace(mass=[1, 1, 5]).mass.tolist()  # [kg]

@@ -1,11 +1,4 @@
-"""Plain functions as data, so that functions of equal code share compiled programs.
-
-JAX knows a function by its identity: each `lambda` of a loop would need a program of
-its own, which JAX keeps for good. Here a function is its code and what it reaches: the
-values of its closure, defaults and global names. Numbers among them are arrays, of
-which new values need no new program. A function that reaches anything that may change
-unseen, such as an object or a module of the user, stays as it is.
-"""
+"""Plain functions as data, so that functions of equal code share compiled programs."""
 
 import builtins
 import dis
@@ -24,6 +17,11 @@ import numpy as np
 from jaxtyping import PyTree
 
 from .user_warnings import warn
+
+# JAX knows a function by its identity: each `lambda` of a loop would need a program of
+# its own. Here a function is its code and the values that it reaches. Numbers among
+# these are arrays, of which new values need no new program. A function that reaches
+# what may change unseen, such as a user's object or module, stays as it is.
 
 # Packages whose functions, classes and constants do not change.
 _FIXED = {
@@ -52,7 +50,7 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True)
 class _Code:
-    """The code of a function, equal to such code in any place of the source."""
+    """A function's code, equal to the same code elsewhere in the source."""
 
     code: types.CodeType = field(compare=False)
     anywhere: types.CodeType
@@ -60,7 +58,7 @@ class _Code:
 
 @functools.lru_cache(maxsize=1024)
 def _anywhere(code: types.CodeType) -> types.CodeType:
-    """Returns code without its lines, which are only for messages."""
+    """Returns code without its line numbers, which only messages need."""
     within = lambda x: _anywhere(x) if isinstance(x, types.CodeType) else x
     constants = tuple(map(within, code.co_consts))
     return code.replace(co_firstlineno=1, co_linetable=b"", co_consts=constants)
@@ -71,7 +69,7 @@ def _code_of(function: types.FunctionType) -> _Code:
 
 
 class SharedFunction(eqx.Module):
-    """A function in parts; equal but for numbers with all functions of equal code."""
+    """A function in parts: its code, and the values that it reaches."""
 
     reach: Any  # values of the closure, defaults, keyword defaults, global names
     code: _Code = eqx.field(static=True)
@@ -94,8 +92,7 @@ class SharedFunction(eqx.Module):
 def sharing_functions(run: Callable[..., _T], **trees: PyTree) -> _T:
     """Returns `run(*trees)`, with plain functions in the trees in their shared form.
 
-    The third callable alike that needs a program of its own brings a warning that names
-    its tree.
+    The third similar callable that needs its own program brings a warning.
     """
     if not any(map(callable, jax.tree.leaves(trees))):
         return run(*trees.values())
@@ -120,7 +117,7 @@ def _is_shared(node: object) -> bool:
 
 
 def _shared(leaf: object) -> object:
-    """Returns a plain function in its shared form if possible; else the leaf itself."""
+    """Returns a plain function in its shared form if possible, else the leaf itself."""
     if not inspect.isfunction(leaf) or leaf.__closure__ is None and _is_fixed(leaf):
         return leaf
     try:
@@ -163,7 +160,7 @@ def _parts_of(
 
 
 def _out_of_order(node: object) -> bool:
-    """Returns whether it is a dict whose values come in another order than JAX's."""
+    """Returns whether a node is a dict whose keys are not sorted, as JAX's are."""
     return isinstance(node, dict) and list(node) != sorted(node)
 
 
@@ -179,7 +176,7 @@ def _global_names(code: types.CodeType) -> frozenset[str]:
 
 
 def _is_fixed(value: object) -> bool:
-    """Returns whether it is a module of a known package, or its function or class."""
+    """Returns whether a value is a known package's module, function or class."""
     name = value.__name__ if inspect.ismodule(value) else None
     if isinstance(value, types.FunctionType | types.BuiltinFunctionType | type):
         name = value.__module__  # None of a builtin that is bound to an object

@@ -1,4 +1,4 @@
-"""Known values: as NumPy arrays, and functions of them as one compiled program."""
+"""Known values in NumPy, and functions of them as one compiled program."""
 
 import functools
 from collections.abc import Callable
@@ -27,16 +27,15 @@ def in_numpy(tree: PyTree) -> PyTree:
 
 
 def known_array(values: ArrayLike) -> Array:
-    """Returns an array of JAX that is known within transformations, too."""
+    """Returns an array of JAX that is known also within transformations."""
     with jax.ensure_compile_time_eval():
         return jnp.asarray(values, float)
 
 
 def at_once(function: Callable) -> Callable:
-    """Decorates a function, which then runs as one program if arguments are known.
+    """Decorates a function, which runs as one compiled program if arguments are known.
 
-    Otherwise JAX would compile each of its operations. The results are known too, also
-    within transformations.
+    Its results are then known too, also within transformations.
     """
     program = eqx.filter_jit(function)
 

@@ -1,8 +1,4 @@
-"""Several results from one fused loop.
-
-XLA on CPU gives each result its own loop over the batch, which computes the results'
-common parts anew.
-"""
+"""Several results from one fused loop."""
 
 import jax
 import jax.numpy as jnp
@@ -10,13 +6,11 @@ from jaxtyping import PyTree
 
 
 def one_loop_on_cpu(tree: PyTree) -> PyTree:
-    """Returns the same arrays, computed by a single loop over the batch.
-
-    Reductions are the only operation of XLA with several results. This reduction takes
-    the maximum of each result and itself, and XLA fuses it into one loop. The equations
-    of motion are then 3 times faster in a batch of 1024, 11 times for a single arm (one
-    core, jax 0.10.2).
-    """
+    """Returns the same arrays, computed by a single loop over the batch."""
+    # XLA on CPU gives each result its own loop, which computes the common parts anew.
+    # Only a reduction has several results; this one takes the maximum of each result
+    # and itself. The equations of motion are then 3 times faster in a batch of 1024, 11
+    # times for a single arm (one core, jax 0.10.2).
     leaves, structure = jax.tree.flatten(tree)
     reduced = jax.lax.reduce(
         tuple(jnp.broadcast_to(leaf, (2, *leaf.shape)) for leaf in leaves),
@@ -28,17 +22,14 @@ def one_loop_on_cpu(tree: PyTree) -> PyTree:
 
 
 def in_one_loop(tree: PyTree) -> PyTree:
-    """Returns the same arrays, on CPU by a single loop; it has no derivatives."""
+    """Returns the same arrays, on CPU by a single loop, without derivatives."""
     return jax.lax.platform_dependent(
         tree, cpu=one_loop_on_cpu, default=lambda tree: tree
     )
 
 
 def entries_in_one_loop(tree: PyTree) -> PyTree:
-    """Returns the same arrays, all entries of vectors computed by a single loop on CPU.
-
-    XLA would compute stacked entries one after the other, and all anew for each.
-    """
+    """Returns the same arrays, on CPU with all entries of vectors from one loop."""
     leaves, structure = jax.tree.flatten(tree)
     floating = lambda leaf: jnp.issubdtype(leaf.dtype, jnp.floating)
     places = [k for k, x in enumerate(leaves) if x.ndim == 1 and x.size and floating(x)]

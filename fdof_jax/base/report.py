@@ -10,11 +10,9 @@ Rows = Sequence[Sequence[str]]
 
 
 class Report(eqx.Module):
-    """A result that prints itself: a verdict, a table, and remarks.
+    """A result that prints itself: a verdict, a table and remarks.
 
-    A notebook shows it as HTML. A subclass implements what it has of `_verdict`,
-    `_rows` and `_remarks`. The first row of a table is its header. Columns without one
-    hold words; an empty header is left out.
+    A notebook shows it as HTML.
     """
 
     def _verdict(self) -> list[str]:
@@ -22,6 +20,7 @@ class Report(eqx.Module):
         return []
 
     def _rows(self) -> list[list[str]]:
+        """Returns the table below its header, which is empty over columns of words."""
         return []
 
     def _remarks(self) -> list[str]:

@@ -1,4 +1,4 @@
-"""Trees of arrays: constant for derivatives, chosen, and how large they are."""
+"""Operations on trees of arrays."""
 
 import functools
 

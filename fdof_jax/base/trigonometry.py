@@ -1,8 +1,6 @@
-"""Sine and cosine from one evaluation, and angles, vectorisable by XLA on CPU.
+"""Sine, cosine and angles that XLA vectorises on CPU.
 
-XLA on CPU calls the scalar C library for float64 `sin`, `cos` and `atan2`, which cost
-more than the rest of the equations of motion together. Range reduction and short
-polynomials in plain arithmetic instead fuse into the surrounding loop.
+Polynomials fuse into loops, unlike calls of the scalar C library.
 """
 
 import jax
@@ -141,14 +139,10 @@ def _sincos_jvp(primals, tangents):
 
 
 def sincos(x: ArrayLike) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Computes sine and cosine of `x`, each to 2 ulp relative, also near their zeros.
+    """Computes the sine and cosine of `x` [rad], each to 2 ulp, also near their zeros.
 
-    This accuracy holds for |x| <= 2**20 rad in float64 and |x| <= 1500 rad in float32.
-    Beyond, the result is that of an angle within one rounding of `x`. Infinities and
-    NaN give NaN. Derivatives of any order are exact. Accelerators use XLA's own sine
-    and cosine.
-
-    **Arguments:** `x`: angles [rad], any shape, float32 or float64.
+    This holds for |x| <= 2**20 in float64 and |x| <= 1500 in float32. Beyond, the
+    result is that of an angle within one rounding of `x`.
     """
     return _sincos(jnp.asarray(x, dtype=jnp.result_type(float, x)))
 

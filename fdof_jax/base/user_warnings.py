@@ -23,10 +23,8 @@ _OMITTED: ContextVar[str | None] = ContextVar("omitted", default=None)
 
 @contextlib.contextmanager
 def without_warning(words: str) -> Iterator[None]:
-    """Omits this library's warnings with these words, in the calling thread alone.
-
-    `warnings.catch_warnings` would change the filters of all threads.
-    """
+    """Omits this library's warnings with these words, in the calling thread alone."""
+    # `warnings.catch_warnings` would change the filters of all threads.
     before = _OMITTED.set(words)
     try:
         yield

@@ -1,4 +1,4 @@
-"""Paths that arguments give, and files that appear only when they are complete."""
+"""Paths that arguments give, and files that appear only when complete."""
 
 import contextlib
 import os
@@ -17,9 +17,9 @@ _SCHEME = re.compile("[A-Za-z][A-Za-z0-9+.-]+:/")
 
 
 def local_path(name: str, value: object, expected: str) -> Path:
-    """Returns the path on this machine that the argument `name` gives; `~` is a home.
+    """Returns the local path that the argument `name` gives; `~` is the home folder.
 
-    Raises ValueError for what is no path, an empty one, and an address.
+    Raises ValueError for an address, an empty path, and what is no path.
     """
     path = os.fspath(value) if isinstance(value, str | os.PathLike) else None
     if not isinstance(path, str) or not path or "\0" in path:
@@ -45,7 +45,7 @@ def file_path(name: str, value: Any) -> Path:
 def folder_path(
     name: str, value: object, expected: str = "a folder", within: str = ""
 ) -> Path:
-    """Returns the folder `within` that of the argument `name`, made if need be."""
+    """Returns the folder `within` the one that `name` gives, made if need be."""
     folder = local_path(name, value, expected) / within
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -60,11 +60,10 @@ def folder_path(
 
 @contextlib.contextmanager
 def whole_file(path: Path) -> Iterator[BinaryIO]:
-    """Opens a new file and replaces that at `path` when the block ends without error.
+    """Opens a new file; it replaces that at `path` when the block ends without error.
 
-    Until then it has a name that no other process uses; after an error it is removed.
-    The new file has the permissions of the old one, and a link at `path` stays. An
-    OSError names `path`.
+    After an error it is removed. It has the permissions of the old file; a link at
+    `path` stays. An OSError names `path`.
     """
     target = Path(os.path.realpath(path))
     # Names have at most 255 bytes, of which a letter takes up to four.

@@ -17,14 +17,14 @@ from .points import Between, Load, Point, over
 class Armature(InertialElement):
     """Rotors geared to the joints: inertia that turns with a joint's relative rate.
 
-    This is the usual approximation, also MuJoCo's: it leaves out the rate of the link
-    that carries the rotor. At gear ratios of 50 and more, accelerations differ by about
-    half a percent. For direct drives and low ratios use `Rotor`, which is exact.
+    As in MuJoCo, the rate of the link that carries the rotor is left out. From gear
+    ratios of 50 on, accelerations are right to about half a percent. For lower ones use
+    `Rotor`, which is exact.
 
     **Arguments:** `inertia`: the rotor's inertia times the square of the gear ratio,
     one per joint or one for all, not negative [kg m^2; kg for a prismatic joint].
 
-    **Raises:** ValueError for malformed or negative inertias.
+    **Raises:** ValueError for malformed arguments.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
@@ -49,22 +49,18 @@ class Armature(InertialElement):
 class Rotor(InertialElement):
     """Rotors of motors, carried by the links before their joints: exact coupling.
 
-    A rotor turns about an axis at right angles to the plane. Its absolute rate is that
-    of the link before the joint plus gear * qd, and its kinetic energy is
-    inertia * rate^2 / 2. Its mass belongs to the link that carries it. A fixed pair has
-    no rotor.
+    A rotor turns about an axis perpendicular to the plane, at the rate of the link
+    before the joint plus gear * qd. Its mass belongs to that link. From gear ratios of
+    50 on, an `Armature` of gear^2 * inertia is as good.
 
-    Use `Rotor` for direct drives and low gear ratios. At ratios of 50 and more, an
-    `Armature` of gear^2 * inertia is as good: it leaves out a share of 1 / gear.
-
-    **Arguments:** one value per joint or one for all.
+    **Arguments:** one per joint or one for all; fixed pairs have no rotor.
 
     - `inertia`: of the rotor itself, not negative [kg m^2].
-    - `gear`: angle of the rotor, relative to the link before, per angle of the joint
-      [1] or per metre of a slide [rad/m]; negative if it turns the other way. The gear
-      of a `DCMotor` is its magnitude.
+    - `gear`: angle of the rotor, relative to the link before, per joint angle [1] or
+      metre of a slide [rad/m]; negative if it turns the other way. The gear of a
+      `DCMotor` is its magnitude.
 
-    **Raises:** ValueError for malformed arguments and negative inertias.
+    **Raises:** ValueError for malformed arguments.
 
     >>> import fdof_jax as fj
     >>> arm = fj.Linkage(
@@ -86,7 +82,7 @@ class Rotor(InertialElement):
         return jnp.where(jnp.stack(fixed_pairs(linkage.ef)), 0, self.inertia)
 
     def loads(self, t, q, qd, qdd, linkage):
-        """Returns the moments of the rotors on the links that carry them."""
+        """Returns the rotors' moments on the links that carry them."""
         spin_up = self.coordinates(qdd, linkage)  # as they are linear
         moments = -self.weights(linkage) * spin_up
         return tuple(Load(Point(k), (0, 0), moment) for k, moment in enumerate(moments))
@@ -95,21 +91,20 @@ class Rotor(InertialElement):
 class LinearActuator(Between, InertialElement):
     """A cylinder and a piston between two points, and the force between them.
 
-    Both bodies lie along the line between their pins. They follow the pins exactly and
-    add no degree of freedom.
+    Both bodies lie along the line between their pins and add no degree of freedom.
 
     **Arguments:**
 
     - `a`, `b`: the `Point`s of the pins, the cylinder's and the piston's.
-    - `force`: the force that pushes the pins apart [N], or a function of (t, length,
-      rate) that returns it [s, m, m/s].
-    - `mass`: masses of the cylinder and the piston, not negative [kg].
+    - `force`: pushes the pins apart [N]; may be a function of (t, length, rate) [s, m,
+      m/s].
+    - `mass`: of the cylinder and the piston, not negative [kg].
     - `com`: distances of their mass centres, the cylinder's from `a` towards `b`, the
       piston's from `b` towards `a` [m].
-    - `inertia`: inertias about their mass centres, not negative [kg m^2].
+    - `inertia`: about their mass centres, not negative [kg m^2].
 
-    **Raises:** ValueError for malformed arguments. Where the pins meet, the line has no
-    direction, and motions end as not finite.
+    **Raises:** ValueError for malformed arguments. Where the pins meet, motions end as
+    not finite.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
@@ -158,10 +153,7 @@ class LinearActuator(Between, InertialElement):
     def loads(
         self, t: Array, q: Array, qd: Array, qdd: Array, linkage: Linkage
     ) -> tuple[Load, Load]:
-        """Returns the pins' loads on the links: the force, weight and inertia.
-
-        The moments about the first pin determine each pin's sideways share.
-        """
+        """Returns the pins' loads on the links: the force, weight and inertia."""
         x1, y1, x2, y2, turning = self.accelerations(q, qd, qdd, linkage)
         weight = 1j * linkage.gravity
         cylinder = self.mass[0] * (plane_vector(x1, y1) + weight)
@@ -169,6 +161,7 @@ class LinearActuator(Between, InertialElement):
         vector, rate = jax.jvp(lambda q: self._bodies(linkage, q)[2], (q,), (qd,))
         length = length_of(vector)
         unit = vector / length
+        # The moments about the first pin determine each pin's sideways share.
         about_a = (
             jnp.sum(self.inertia) * turning
             + self.com[0] * cross(unit, cylinder)

@@ -48,7 +48,7 @@ def inertial_on(linkage: Linkage, forces: Forces) -> tuple[InertialElement, ...]
 
 
 def energetic_on(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
-    """Checks the tuple of elements and returns those with energy, springs included."""
+    """Checks the tuple of elements and returns those with energy."""
     parts = _without_times(linkage, forces)
     return tuple(e for e in parts if e.potential_energy is not None)
 
@@ -84,11 +84,11 @@ def added_inertia(
 ) -> tuple[Upper | None, Array | int]:
     """Computes what elements add to the mass matrix and the bias (n,), or (None, 0).
 
-    M = J^T W J and bias = J^T W (dJ/dt) qd + dV/dq, where J is the derivative of the
-    coordinates. Forward mode alone keeps the code of further derivatives small.
+    M = J^T W J and bias = J^T W (dJ/dt) qd + dV/dq, with the coordinates' Jacobian J.
     """
     if not inertial(forces):
         return None, 0
+    # Forward mode alone keeps the code of further derivatives small.
     matrices, biases = [], []
     for element in inertial(forces):
         coordinates = lambda q, e=element: e.coordinates(q, linkage)

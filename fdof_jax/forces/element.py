@@ -1,8 +1,4 @@
-"""Force elements: forces and torques on the joints besides gravity.
-
-A scene holds a tuple of elements, whose efforts add up. Where such a tuple enters the
-library, `elements` adapts other callables, such as plain functions.
-"""
+"""Force elements: forces and torques on the joints besides gravity."""
 
 import inspect
 from abc import abstractmethod
@@ -27,36 +23,33 @@ OwnStates = tuple[PyTree, ...]  # of `StatefulElement`s, in the order of the for
 
 
 class Element(Part):
-    """A force element, which acts on an arm: a pytree that computes joint efforts.
+    """A force element: a pytree that computes joint efforts.
 
-    `replace(name=...)` returns a checked copy with other values of the constructor's
-    arguments. These are the fields; a class with other arguments has a method
-    `arguments`, which returns a dictionary of them.
+    A subclass implements `__call__`. Joint positions, velocities and efforts have shape
+    (n,) [m or rad; m/s or rad/s; N or N m]. All else has a default:
 
-    A subclass implements `__call__`, with joint positions, velocities and efforts of
-    shape (n,) [m or rad; m/s or rad/s; N or N m]. All else has a default:
-
-    - `conditions`: conditions on values, besides the bounds that `field` declares;
-      `conditions_on(linkage)`: those on the arm's joints.
-    - `jump_ts`: a time at which the efforts jump, or a list of such times; steps end
-      there [s]. By default, the jumps of its fields: of a reference, or of a function
-      of time.
-    - `check(linkage, ts)`: raises ValueError if the element does not fit the arm; after
-      a failed motion, `simulate` calls it for its message.
+    - `conditions`: yields conditions on values, besides the bounds that `field`
+      declares; `conditions_on(linkage)`: those on the arm's joints.
+    - `jump_ts`: one or several times [s] at which the efforts jump; steps end there. By
+      default, the jumps of its fields.
+    - `check(linkage, ts)`: raises ValueError if the element does not fit the arm;
+      `simulate` calls it after a failed motion.
     - `potential_energy(q, linkage)`: energy that it stores, () [J]; by default None.
+    - `arguments()`: a dictionary of the constructor's arguments, by default the fields;
+      `replace(name=...)` returns a checked copy with other values.
 
-    An element with a state is a `StatefulElement`, one that moves masses is an
-    `InertialElement`, one that pushes at points of links is a `PointElement`.
+    A `StatefulElement` has a state, an `InertialElement` moves masses, a `PointElement`
+    acts at points of links.
 
     >>> import fdof_jax as fj
+    >>> import jax.numpy as jnp
     >>> class Drag(fj.Element):
     ...     coefficient: fj.Values = fj.field(unit="N m s^2/rad^2", minimum=0)
     ...     def __call__(self, t, q, qd, linkage):
     ...         return -self.coefficient * abs(qd) * qd
-    >>> Drag(-1)
-    Traceback (most recent call last):
-    ValueError: coefficient: expected an array of n real numbers, all finite, at least \
-0 [N m s^2/rad^2] (or one number for all), got -1.
+    >>> arm = fj.scenes.double_pendulum().linkage
+    >>> Drag(0.5)(0.0, jnp.zeros(2), jnp.array([2.0, -4.0]), arm).tolist()
+    [-2.0, 8.0]
     """
 
     @abstractmethod
@@ -107,7 +100,6 @@ class _Opened(ForeignElement):
 
 
 def element_of(value: Callable) -> Element:
-    """Returns a callable as an element."""
     return value if isinstance(value, Element) else ForeignElement(value)
 
 
@@ -124,8 +116,6 @@ def elements(name: str, forces: Forces) -> tuple[Element, ...]:
 
 def elements_on(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
     """Returns forces as elements, with one number for all joints repeated for each.
-
-    Programs then do not depend on how the numbers were given.
 
     **Raises:** ValueError unless `forces` is a tuple of callables whose values suit the
     number of joints.
@@ -152,10 +142,7 @@ _UNTRACEABLE = (
 
 @contextmanager
 def naming(place: str) -> Iterator[None]:
-    """Adds an element's place, such as `forces[0]`, to messages about its values.
-
-    Those about arguments of the call, and those without a name, stay as they are.
-    """
+    """Adds an element's place, such as `forces[0]`, to messages about its values."""
     try:
         yield
     except _UNTRACEABLE as error:
@@ -190,10 +177,10 @@ class ScalarElement(Element):
 
 
 class StatefulElement(Element):
-    """A force element with a state of its own: an integral, a current, a lag.
+    """A force element with a state of its own, such as an integral or a current.
 
-    A subclass implements `initial_state` and `__call__`, which returns the efforts
-    [N or N m] and the rate of the state.
+    A subclass implements `initial_state` and `__call__`, which returns efforts [N or N
+    m] and the rate of the state.
     """
 
     @abstractmethod
@@ -213,21 +200,15 @@ class StatefulElement(Element):
 class InertialElement(Element):
     """A force element with masses, which add to the equations of motion.
 
-    Its kinetic energy is the sum of weight * (d coordinate/dt)^2 / 2 [J]. For a body,
-    the coordinates of the mass centre have the mass as weight, and the angle has the
-    inertia. A subclass implements `coordinates` and `weights`, and `at` if its masses
-    depend on time.
-
-    Mass leaves or arrives with the velocity of the body, as from a leaking bucket: the
-    equation of motion is M(t) qdd + bias = tau, without a term dM/dt. Only a `Payload`
-    arrives with a velocity of its own.
+    Its kinetic energy is the sum of weight * (d coordinate/dt)^2 / 2 [J]. The weight of
+    a mass centre's coordinates is the mass, that of an angle the inertia. A subclass
+    implements `coordinates` and `weights`, and `at` if its masses depend on time. Mass
+    then leaves or arrives with the velocity of the body: M(t) qdd + bias = tau, without
+    dM/dt.
     """
 
     def at(self, t: Array | np.ndarray) -> "InertialElement":
-        """Returns the element with its masses at a time, constant from then on.
-
-        Returns the element itself if its masses never change.
-        """
+        """Returns an element with the masses of a time; itself if they never change."""
         return self
 
     @abstractmethod
@@ -255,7 +236,7 @@ class InertialElement(Element):
     def loads(
         self, t: Array, q: Array, qd: Array, qdd: Array, linkage: Linkage
     ) -> tuple[PyTree, ...] | None:
-        """Returns the `Load`s of the masses on points, for `joint_reactions` alone."""
+        """Returns the `Load`s of the masses on points, for `joint_reactions`."""
         return None
 
     def loads_on_points(self, t, q, qd, qdd, linkage):

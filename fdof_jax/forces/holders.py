@@ -1,8 +1,4 @@
-"""Elements that hold joints for a while: dry friction, hard stops, brakes.
-
-A fictitious joint of the paper is held at rest by a generalised constraint force. What
-an element here holds is held by one too, for as long as the element's law allows.
-"""
+"""Elements that hold joints for a while: dry friction, hard stops, brakes."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -22,19 +18,19 @@ from .element import Forces, ScalarElement
 
 
 class Holder(ScalarElement):
-    """Base of elements that hold joints; a motion has the modes of its joints.
+    """The base of elements that hold joints.
 
     Called by itself, an element returns its efforts at joints that are not held.
     """
 
     @property
     def holds(self) -> bool:
-        """True if joints stand still exactly by its law."""
+        """Whether joints stand exactly still by its law."""
         return True
 
     @property
     def counted(self) -> bool:
-        """True if `Solution.taken` has all that it takes."""
+        """Whether `Solution.taken` has all the energy that it takes."""
         return self.holds
 
     def levels(self, joints: int, *at: Any) -> tuple[Array, Array]:
@@ -72,28 +68,25 @@ def toward(friction: Array, direction: ArrayLike | Scalars) -> Array:
 class JointFriction(Holder):
     """Coulomb friction of the joints, which sticks, or is rounded off with `speed`.
 
-    While a joint slides, the effort is -level * sign(qd). When its rate reaches zero
-    and the static friction can hold it, the joint stands exactly still until its load
-    exceeds the static friction.
+    A sliding joint has the effort -level * sign(qd). When its rate reaches zero, it
+    stands exactly still as long as the static friction can hold its load.
 
-    With `speed`, the effort is -level * tanh(qd / speed) instead: joints never stick,
-    and creep at a fraction of `speed` under loads below the level. The smaller `speed`,
-    the stiffer the equations.
+    With `speed`, the effort is -level * tanh(qd / speed). Joints then never stick, and
+    creep under loads below the level. A small `speed` makes the equations stiff.
 
     **Arguments:** one per joint or one for all.
 
-    - `level`: of sliding friction, not negative [N or N m].
-    - `static`: greatest friction that holds a joint at rest, at least the level; by
-      default the level [N or N m].
+    - `level`: sliding friction, not negative [N or N m].
+    - `static`: greatest friction at rest, at least the level; by default the level [N
+      or N m].
     - `speed`: positive [m/s or rad/s].
 
-    `level` and `static` may also have two rows, (2, n), against motions in the positive
-    and in the negative direction. Each may be a function `(t, q, qd, linkage)` that
-    returns such numbers, positive and smooth in each direction, for instance
-    `stribeck`. Its attribute `jump_ts` lists times at which it jumps. Joints at rest
-    are held by the value at qd = 0. Negative values, and static friction below the
-    level, end a motion as not finite. `Solution.taken` does not count a level that is a
-    function.
+    `level` and `static` may have two rows (2, n), for the positive and the negative
+    direction. Each may be a function `(t, q, qd, linkage)` that returns such numbers,
+    positive and smooth in each direction, such as `stribeck`. The value at qd = 0 holds
+    joints at rest; an attribute `jump_ts` lists times at which the function jumps.
+    Negative values, and static friction below the level, end a motion as not finite.
+    `Solution.taken` does not count a level that is a function.
 
     **Raises:** ValueError for malformed arguments, and for `static` beside `speed`.
 
@@ -101,10 +94,6 @@ class JointFriction(Holder):
     >>> arm = fj.scenes.fig5().linkage
     >>> fj.forces.JointFriction(5)(0.0, [0, 0, 0], [0.0, 0.01, -1.0], arm).tolist()
     [0.0, -5.0, 5.0]
-    >>> level = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[0.1])
-    >>> holds = fj.forces.JointFriction(1.5 * 9.81 * 0.5)
-    >>> fj.simulate(level, fj.State([0.0], [0.0]), [0, 10.0], (holds,)).q[-1].tolist()
-    [0.0]
     """
 
     level: Any = field(unit="N or N m", minimum=0, rows=2, function=True)
@@ -184,7 +173,7 @@ class stribeck(Part):  # named as the function that it is
     **Arguments:** one per joint or one for all.
 
     - `coulomb`, `static`: friction at high speed and at rest, not negative [N or N m].
-    - `speed`: speed at which most of the difference is gone, positive [m/s or rad/s].
+    - `speed`: where most of the difference is gone, positive [m/s or rad/s].
 
     **Raises:** ValueError for malformed arguments.
 
@@ -209,17 +198,16 @@ class stribeck(Part):  # named as the function that it is
 class HardStops(Holder):
     """Rigid stops at the ends of the joints' ranges: impacts, bouncing and resting.
 
-    A joint that reaches its stop at a rate v leaves it at -restitution * v; the blow
-    also changes the rates of the other joints. A blow breaks the hold of friction, but
-    not that of brakes. A joint whose bounces become too small to resolve rests on the
-    stop until something pulls it away: the bounces left out last about 1e-5 s and are
-    1e-11 m or rad high (in float32, 1e-3 and 1e-5). Use the soft `JointStops` where the
-    give of the stop matters, or where several contacts at once share loads.
+    A joint that hits its stop at a rate v leaves it at -restitution * v. The impact
+    changes the rates of the other joints, and breaks the hold of friction, but not of
+    brakes. A joint whose bounces fall below 1e-11 m or rad (in float32, 1e-5) rests
+    until something pulls it away; the bounces left out last about 1e-5 s (1e-3 s). Use
+    the soft `JointStops` where the give matters, or several contacts share a load.
 
-    **Arguments:** all in joint order, one per joint or one for all.
+    **Arguments:** one per joint or one for all.
 
     - `lower`, `upper`: ends of the range [m or rad]; may be infinite.
-    - `restitution`: from 0, the default (blows take all of the rate), to 1 (elastic).
+    - `restitution`: from 0, the default (no rebound), to 1 (elastic).
 
     **Raises:** ValueError for malformed arguments, and unless lower < upper.
 
@@ -242,16 +230,14 @@ class HardStops(Holder):
 
 
 class Brake(Holder):
-    """A brake that holds joints between two known times, whatever that takes.
+    """A brake that holds joints between two known times, whatever their load.
 
-    When the brake engages, a blow stops its joints and changes the rates of the others.
-    If it holds at the start of a motion, it engages there: the first rates of the
-    motion are those after its blow.
+    When it engages, an impulse stops its joints and changes the rates of the others. If
+    it holds at the start, the first rates of a motion are those after its impulse.
 
     **Arguments:**
 
-    - `joints`: the number of a joint, from 1, or several such numbers; fixed pairs are
-      held in any case.
+    - `joints`: one or several numbers of joints, from 1.
     - `begin`, `end`: times at which the brake engages and lets go [s]; by default it
       always holds.
 
@@ -290,7 +276,6 @@ class Brake(Holder):
 
     @property
     def jump_ts(self) -> Array:
-        """The times at which the brake engages and lets go [s]."""
         return jnp.stack([self.begin, self.end])
 
     def braking(self, t, linkage):

@@ -1,7 +1,4 @@
-"""Force elements in the joints: dampers, springs, efforts and stops.
-
-Stops are not part of the paper's model.
-"""
+"""Force elements in the joints: dampers, springs, efforts and stops."""
 
 import jax
 import jax.numpy as jnp
@@ -17,13 +14,10 @@ from .switches import switch
 class JointDamper(ScalarElement):
     """Viscous damping of the real joints, as in Fig 3: -coefficient * qd.
 
-    At a revolute joint, `qd` is the relative rate, and the preceding link takes the
-    reaction.
+    **Arguments:** `coefficient`: one per joint or one for all, not negative [N s/m or N
+    m s/rad].
 
-    **Arguments:** `coefficient`: one for all joints or one per joint, not negative
-    [N s/m or N m s/rad].
-
-    **Raises:** ValueError for malformed or negative coefficients.
+    **Raises:** ValueError for malformed arguments.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
@@ -40,15 +34,14 @@ class JointDamper(ScalarElement):
 class JointSpring(ScalarElement):
     """Linear springs in the joints: -stiffness * (q - rest).
 
-    At a revolute joint, `q` is the relative angle, never wrapped: a spring that is
-    wound up by a turn unwinds. The preceding link takes the reaction.
+    Angles are never wrapped: a spring that is wound up by a turn unwinds.
 
     **Arguments:** one value per joint or one for all.
 
     - `stiffness`: not negative [N/m or N m/rad].
     - `rest`: positions at which the springs are slack [m or rad].
 
-    **Raises:** ValueError for malformed arguments and negative stiffnesses.
+    **Raises:** ValueError for malformed arguments.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
@@ -65,16 +58,15 @@ class JointSpring(ScalarElement):
         return tuple(-stiffness * (x - rest) for stiffness, rest, x in rows)
 
     def potential_energy(self, q: Array, linkage: Linkage) -> Array:
-        """Computes the energy of the springs [J]."""
         return jnp.sum(self.stiffness * (q - self.rest) ** 2) / 2
 
 
 class JointEffort(ScalarElement):
     """Constant joint efforts, the paper's F and T inputs.
 
-    **Arguments:** `tau`: one for all joints or one per joint [N or N m].
+    **Arguments:** `tau`: one per joint or one for all [N or N m].
 
-    **Raises:** ValueError for malformed efforts.
+    **Raises:** ValueError for malformed arguments.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
@@ -114,7 +106,6 @@ class EffortHistory(ScalarElement):
 
     @property
     def jump_ts(self) -> Array:
-        """The times, at which the efforts have kinks [s]."""
         return self.ts
 
     def schedule(self, t, linkage):
@@ -128,21 +119,20 @@ class EffortHistory(ScalarElement):
 class JointStops(ScalarElement):
     """Stops at the ends of the joints' ranges: stiff springs that push one way.
 
-    At a penetration p the force is stiffness * p * (1 + damping * rate), and never less
-    than 0; the rate is that of the joint, outwards. Steps end where the contact begins
-    and ends. Rigid `HardStops` cost no short steps: use soft stops where the give of a
-    stop matters.
+    At a penetration p the effort is stiffness * p * (1 + damping * rate), never less
+    than 0; the rate is that of the joint, outwards. Steps end where contact begins and
+    ends. Rigid `HardStops` need no short steps.
 
-    With `smoothing`, p is a parabola within that distance of the end of the range, on
-    both sides; at the end itself p is a quarter of `smoothing`. The damping acts by the
-    joint's own rate, so that a blow loses as much as without `smoothing`.
+    With `smoothing`, p is a parabola within that distance on both sides of the end of
+    the range; at the end itself, p is a quarter of `smoothing`. Impacts lose as much
+    energy as without it.
 
-    **Arguments:** all in joint order, one per joint or one for all.
+    **Arguments:** one per joint or one for all.
 
     - `lower`, `upper`: ends of the range [m or rad]; may be infinite.
     - `stiffness`: positive [N/m or N m/rad].
     - `damping`: not negative [s/m or s/rad].
-    - `smoothing`: positive [m or rad]; by default the law is not rounded off.
+    - `smoothing`: positive [m or rad]; by default none.
 
     **Raises:** ValueError for malformed arguments, and unless lower < upper.
 
@@ -175,7 +165,6 @@ class JointStops(ScalarElement):
         )
 
     def potential_energy(self, q: Array, linkage: Linkage) -> Array:
-        """Computes the energy of the springs [J]."""
         below = _stored(self.lower - q, self.smoothing)
         above = _stored(q - self.upper, self.smoothing)
         return jnp.sum(self.stiffness * (below + above))

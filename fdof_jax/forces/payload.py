@@ -14,20 +14,18 @@ from .points import Load, Point
 class Payload(InertialElement):
     """A body that is fixed to a link between two known times.
 
-    When the body is taken, a blow changes the rates of all joints: the momenta of arm
-    and body before are those of both together after. When it is let go, rates do not
-    jump. Functions without a time, such as `mass_matrix` and `energy`, need `at(t)`,
-    the payload at a time.
+    At pick-up, an impulse changes the rates of all joints; generalised momenta are
+    kept. Release changes no rate. Functions without a time, such as `mass_matrix`, take
+    its `at(t)`.
 
     **Arguments:**
 
-    - `place`: the `Point` of the link at which its mass centre is fixed.
+    - `place`: the `Point` of a moving link at which its mass centre is fixed.
     - `mass`, `inertia`: not negative [kg, kg m^2].
-    - `begin`, `end`: times at which it is taken and let go [s]; by default the arm
-      always has it. A payload taken at the start of a motion, or before, is part of the
-      arm from the start.
-    - `velocity`: velocity of the body before it is taken, (x, y) [m/s], or with its
-      angular rate (x, y, rate) [rad/s]; by default the body is at rest.
+    - `begin`, `end`: times of pick-up and release [s]; by default the arm always has
+      it. A payload picked up at the start of a motion, or before, causes no impulse.
+    - `velocity`: before pick-up, (x, y) [m/s] or (x, y, angular rate) [m/s, rad/s]; by
+      default 0.
 
     **Raises:** ValueError for malformed arguments, and unless begin < end.
 
@@ -60,17 +58,16 @@ class Payload(InertialElement):
 
     @property
     def jump_ts(self) -> Array | None:
-        """The times at which it is taken and let go [s]."""
         times = [t for t in (self.begin, self.end) if t is not None]
         return jnp.stack(times) if times else None
 
     def there(self, t: Array | np.ndarray) -> Truth:
-        """Returns whether it is taken at a time."""
+        """Returns whether the arm has it at a time."""
         taken = True if self.begin is None else has_come(self.begin, t)
         return taken & (True if self.end is None else ~has_come(self.end, t))
 
     def at(self, t: Array | np.ndarray) -> "Payload":
-        """Returns the payload at a time, without mass where it is not taken."""
+        """Returns the payload at a time, without mass unless the arm has it."""
         if self.jump_ts is None:
             return self
         there = self.there(t)
@@ -98,7 +95,7 @@ class Payload(InertialElement):
 
     @property
     def arriving(self) -> Array:
-        """The rates of its coordinates before it is taken, (3,)."""
+        """The rates of its coordinates before pick-up, (3,)."""
         return jnp.zeros(3).at[: len(self.velocity)].set(self.velocity)
 
     def loads(self, t, q, qd, qdd, linkage):

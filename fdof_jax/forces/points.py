@@ -1,8 +1,4 @@
-"""Force elements at points of links: springs, constant forces, wrenches.
-
-The code uses scalars, which fuse with the equations of motion, and complex numbers as
-vectors of the plane.
-"""
+"""Force elements at points of links: springs, constant forces, wrenches."""
 
 from abc import abstractmethod
 from functools import reduce
@@ -49,9 +45,8 @@ class Point(Part):
     **Arguments:**
 
     - `link`: 0 is the ground, 1, 2, ... are the moving links.
-    - `along`, `across`: coordinates in the link's own frame [m]. Its origin is the
-      link's characteristic point, or the ground pivot. Its first axis is the link's
-      vector A; the ground's first axis is at the base angle.
+    - `along`, `across`: coordinates from the link's start, or the ground pivot [m]. The
+      first axis is the link's vector A; the ground's is at the base angle.
 
     **Raises:** ValueError for another link or malformed numbers.
 
@@ -132,10 +127,9 @@ def work(
 class PointElement(ScalarElement):
     """A force element that acts on points of links or of the ground.
 
-    A subclass implements `loads` [N and N m]. The bearings carry these loads, unlike
-    efforts in the joints: see `joint_reactions`. In `loads`, `frames` says where links
-    are: `point.place(frames)` is a point's position, `point.velocity(frames, qd)` its
-    velocity, both as complex numbers x + iy [m, m/s]. A force may be one, too.
+    A subclass implements `loads` [N and N m], which `joint_reactions` includes. In it,
+    `point.place(frames)` is a point's position and `point.velocity(frames, qd)` its
+    velocity, as complex numbers x + iy [m, m/s]. Forces may be complex, too.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
@@ -184,7 +178,7 @@ class Between(Element):
 
 
 def over(length: Array) -> Array:
-    """Returns the reciprocal of a length; 1 where points meet and have no line."""
+    """Returns the reciprocal of a length; 1 where points meet."""
     return 1 / jnp.where(length > 0, length, 1)
 
 
@@ -218,14 +212,14 @@ class SpringDamper(LineElement):
     """A spring and a damper between two points, along the line that joins them.
 
     The tension is stiffness * (length - rest_length) + damping * d(length)/dt. With a
-    rest length, points that meet have no line, and the force is 0 there.
+    rest length, the force is 0 where the points meet.
 
     **Arguments:**
 
     - `a`, `b`: the two `Point`s.
     - `stiffness` [N/m], `damping` [N s/m], `rest_length` [m]: not negative.
-    - `one_sided`: "cable" only pulls and "bumper" only pushes; neither acts on the
-      other side of the rest length. False: the element pulls and pushes.
+    - `one_sided`: "cable" only pulls, beyond the rest length; "bumper" only pushes,
+      below it; False, the default, does both.
 
     **Raises:** ValueError for malformed arguments.
 
@@ -277,7 +271,6 @@ class SpringDamper(LineElement):
         return jnp.where(on, pull, 0)
 
     def potential_energy(self, q: Array, linkage: Linkage) -> Array:
-        """Computes the energy of the spring [J]."""
         stretch = self.length(linkage, q) - self.rest_length
         energy = self.stiffness * stretch**2 / 2
         if self.side is None:
@@ -289,10 +282,8 @@ class SpringDamper(LineElement):
 class Tension(LineElement):
     """A constant force between two points, along the line that joins them.
 
-    Its potential energy is tension times length, which `energy` includes.
-
-    **Arguments:** `a`, `b`: the two `Point`s; `tension`: positive pulls them
-    together [N].
+    **Arguments:** `a`, `b`: the two `Point`s; `tension`: positive pulls them together
+    [N].
 
     **Raises:** ValueError for malformed arguments.
 
@@ -309,7 +300,6 @@ class Tension(LineElement):
         return self.tension * over(length)
 
     def potential_energy(self, q: Array, linkage: Linkage) -> Array:
-        """Computes tension times length [J], whose slope is the force."""
         return self.tension * self.length(linkage, q)
 
 
@@ -326,8 +316,8 @@ class Wrench(PointElement):
     **Arguments:**
 
     - `point`: the `Point` of application.
-    - `force`: (x, y) [N], or a function of time that returns it.
-    - `moment`: counter-clockwise [N m], or a function of time that returns it.
+    - `force`: (x, y) [N]; `moment`: counter-clockwise [N m]. Each may be a function of
+      time.
     - `follows`: whether the force is (along, across) and turns with the link.
 
     **Raises:** ValueError for malformed arguments.

@@ -17,28 +17,25 @@ _THEN = "a function (t, q, qd, linkage) that returns positions and velocities (q
 
 
 class Reset(Element):
-    """Replaces the state where a function of it passes 0, as a blow or a new foothold.
+    """Replaces the state where a function of it passes 0, such as at a footfall.
 
-    Steps end there exactly, and derivatives of first and second order include the time
-    of the jump, `Solution.events` records it (of joint 0), and `Solution.taken` counts
-    the energy of links and loads that it takes. It has no efforts.
+    First and second derivatives include the time of the jump. `Solution.events` records
+    it as joint 0; `Solution.taken` counts the energy of links and loads that it takes.
 
-    After the jump `when` may be 0 still, or on its other side: the next one comes when
-    it passes its zero again. A motion that starts on the zero does not jump there.
-    Where a blow, a payload or another reset carries `when` over its zero, it jumps at
-    once. Jumps that follow each other ever faster, as those of a ball that comes to
-    rest, end the motion ("too many switches"): `HardStops` hold what rests. So does a
-    new state that is not finite or beyond a hard stop ("not finite").
+    After a jump `when` may still be 0; the next one comes when it passes 0 again. A
+    start on 0 does not count. Where an impact, a payload or another reset carries
+    `when` over 0, the state jumps at once. Jumps that follow ever faster end the motion
+    ("too many switches"); `HardStops` hold what comes to rest. A new state that is not
+    finite, or beyond a hard stop, ends it too ("not finite").
 
     **Arguments:**
 
-    - `when`: `(t, q, qd, linkage) -> number`, of the time [s], joint positions and
+    - `when`: `(t, q, qd, linkage) -> number`, of time [s], joint positions and
       velocities (n,) [m or rad], smooth near its zeros, in any unit in which it is not
       tiny.
-    - `then`: `(t, q, qd, linkage) -> (q, qd)`: the state after the jump; of fixed pairs
-      it is ignored.
-    - `direction`: 1 if it jumps only where `when` rises through 0, -1 only where it
-      falls, 0 in both cases.
+    - `then`: `(t, q, qd, linkage) -> (q, qd)`: the state after the jump, ignored at
+      fixed pairs.
+    - `direction`: 1 if only rises of `when` count, -1 if only falls, 0 for both.
 
     **Raises:** ValueError for malformed arguments.
 
@@ -90,8 +87,7 @@ class Reset(Element):
 def condition(value: Any, expected: str, q: Array) -> Array:
     """Returns no efforts; the zeros of a number become ends of steps.
 
-    Where it is NaN, efforts are, too: no zero would be seen. Raises ValueError for what
-    is not one real number.
+    Where it is NaN, so are the efforts. Raises ValueError unless it is a real number.
     """
     given = isinstance(value, float | int | np.ndarray | np.generic | Array)
     if not given or jnp.shape(value) != ():

@@ -1,8 +1,6 @@
 """Formulas with branches, whose changes the integrator locates.
 
-Outside of a solve a `switch` is a `where`. A step of an adaptive solve keeps to the
-branches in force at its start, so that the equations of the step are smooth, and ends
-where a switching function changes its sign.
+A step keeps to the branches in force at its start, and ends where they change.
 """
 
 from collections.abc import Iterator, Sequence
@@ -22,10 +20,10 @@ _DEALING: ContextVar["Switches | None"] = ContextVar("dealing", default=None)
 class Switches:
     """Gives each switch of the elements the side in force, in the order of their calls.
 
-    `sides` (n,): 1 above and -1 below zero, 0 for the function's own sign; None stands
-    for zeros.
-    `values`: the switching functions as they were met; `jumping`: with which of their
-    entries efforts jump, None for those of conditions.
+    - `sides` (n,): 1 above and -1 below zero, 0 for the function's own sign; None means
+      zeros.
+    - `values`: the switching functions met; `jumping`: whether efforts jump with their
+      entries, None for conditions.
     """
 
     def __init__(self, sides: Array | None):
@@ -81,17 +79,16 @@ def switch(
 ) -> Array:
     """Returns `above` where the switching function `g` is positive, `below` elsewhere.
 
-    `g` may have any unit [for instance m, rad or N] in which it is not tiny: less than
-    1e-13 counts as 0. Adaptive steps end where `g` changes its sign, and derivatives
-    include the effect of that time. Within a step both branches are continued beyond
-    the zero of `g`, and must be smooth and finite there. For jumps at known times, as
-    in references, declare `jump_ts` instead.
+    Adaptive steps end where `g` changes its sign, and derivatives include the effect of
+    that time. `g` may have any unit [such as m, rad or N] in which it is not tiny: less
+    than 1e-13 counts as 0. Both branches are used beyond the zero of `g`, and must be
+    smooth and finite there. For jumps at known times declare `jump_ts` instead.
 
-    `continuous`: whether every effort that uses the result is the same on both sides
-    where `g` is 0; programs for derivatives then compile faster.
+    `continuous`: whether efforts are the same on both sides where `g` is 0; programs
+    for derivatives then compile faster.
 
-    **Raises:** ValueError within a function that the element itself transforms by
-    `jax.jit`, `jax.vmap`, `jax.grad` or the like.
+    **Raises:** ValueError within a function that the element itself transforms, as by
+    `jax.jit`, `jax.vmap` or `jax.grad`.
 
     >>> import fdof_jax as fj
     >>> class Drag(fj.Element):  # air on one side, water on the other
@@ -117,8 +114,8 @@ def _chosen(
 def clip(x: ArrayLike, low: ArrayLike, high: ArrayLike) -> Array:
     """Returns `x` clipped to [low, high]; adaptive steps end where clipping begins.
 
-    All have one unit [for instance N or N m]. At an end of the interval, the derivative
-    is that within it.
+    All have one unit [such as N or N m]. At an end of the interval, the derivative is
+    that within it.
 
     >>> import fdof_jax as fj
     >>> fj.forces.clip([-3.0, 0.5, 3.0], -1, 2).tolist()

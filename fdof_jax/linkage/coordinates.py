@@ -9,11 +9,11 @@ from .linkage import Linkage, per_joint
 
 
 class State(NamedTuple):
-    """Joint positions and velocities; a bare pytree that functions check on use.
+    """Joint positions and velocities, which functions check on use.
 
-    - `q`: the slide B_k [m] of a prismatic joint or the relative angle th_{k+1} - th_k
-      [rad] of a revolute joint, in joint order (n,). Ignored at fixed pairs.
-    - `qd`: the rates of `q` (n,).
+    - `q` (n,): the slide B_k [m] of a prismatic joint or the relative angle th_{k+1} -
+      th_k [rad] of a revolute joint, in joint order. Ignored at fixed pairs.
+    - `qd` (n,): the rates of `q`.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage

@@ -1,8 +1,6 @@
 """The base of elements, references, paths and timings: declared values and conditions.
 
-Bounds of an array are declared by `field`, all else by `conditions`. Constructors raise
-ValueError for other values. `simulate` raises it too, since `equinox.tree_at` bypasses
-constructors. Where values are traced, `possible` reports them to the program.
+`simulate` checks them again, as `equinox.tree_at` bypasses constructors.
 """
 
 import dataclasses
@@ -61,20 +59,20 @@ def field(
 ) -> Any:
     """Declares an array of real numbers as a field of an element or a reference.
 
-    Constructors and `simulate` raise ValueError for values out of bounds; if they are
+    Constructors and `simulate` raise ValueError for values out of bounds. If they are
     traced, the motion ends as not finite.
 
     **Arguments:**
 
-    - `shape`: by default one number per joint, or one for all (then `each` repeats it);
-      `None` within it stands for any length, "joint" for the number of joints.
-    - `unit`: for messages, for instance "N m s/rad".
+    - `shape`: by default one number per joint, or one for all. In a shape, None stands
+      for any length, "joint" for the number of joints.
+    - `unit`: for messages, such as "N m s/rad".
     - `minimum`, `above`: lower bounds, inclusive and exclusive; `finite`: whether
       infinities are rejected.
-    - `function`, `optional`: whether a function that returns such an array, or None, is
-      accepted; None always is where it is the default.
-    - `rows`: an array of so many rows, each like `shape`, is accepted as well.
-    - `default`, `kw_only`: as of `dataclasses.field`.
+    - `function`: whether a function that returns such an array is accepted; `optional`:
+      whether None is. A default of None always is.
+    - `rows`: so many rows, each like `shape`, are accepted as well.
+    - `default`, `kw_only`: as in `dataclasses.field`.
     """
     per_joint = shape is None
     rules = dict(shape=(JOINT,) if per_joint else shape, broadcast=per_joint, unit=unit)
@@ -85,14 +83,14 @@ def field(
 
 
 def called(expected: str) -> Any:
-    """Declares a field that is called, and says in words what is expected there."""
+    """Declares a field that is called; `expected` describes it in messages."""
     return dataclasses.field(metadata={"called": expected})
 
 
 def of_kind(kind: type, default: Any = dataclasses.MISSING) -> Any:
     """Declares a field that is an instance of a class, or None if that is the default.
 
-    The constructor raises ValueError for anything else.
+    **Raises:** the constructor raises ValueError for anything else.
 
     >>> import fdof_jax as fj
     >>> class Pad(fj.Element):
@@ -107,10 +105,9 @@ def of_kind(kind: type, default: Any = dataclasses.MISSING) -> Any:
 
 
 class default:
-    """Decorates a method that computes an attribute unless a subclass has its own.
+    """Decorates a method that computes an attribute unless a subclass has its own."""
 
-    Unlike a property, it does not stand in the way of a field of the same name.
-    """
+    # Unlike a property, it allows a field of the same name.
 
     def __init__(self, compute: Callable[[Any], Any]):
         self.compute = compute
@@ -124,9 +121,9 @@ class default:
 class Condition(NamedTuple):
     """A condition on the values of an element or a reference: see `Element.conditions`.
 
-    - `holds`: whether it is fulfilled: a bool, or an array whose entries must all be.
-    - `name`, `expected`: parts of the message if it is not; `got`: the value that the
-      message shows, or a tuple of several.
+    - `holds`: a bool, or an array of which all entries must be true.
+    - `name`, `expected`, `got`: parts of the message if it does not hold. A tuple `got`
+      shows several values.
     """
 
     holds: Truth
@@ -145,9 +142,6 @@ class Part(Frozen, metaclass=_Fields):
 
     Elements and references are parts, and may have further ones as fields.
 
-    - `ordered(first, second)`: yields the condition that a field is less than another.
-    - `value_of(name, *arguments)`: a field, or what the function in its place returns.
-
     >>> import fdof_jax as fj
     >>> class Range(fj.forces.Part):
     ...     lower: fj.Values = fj.field(unit="rad")
@@ -164,7 +158,7 @@ class Part(Frozen, metaclass=_Fields):
         return ()
 
     def conditions_on(self, linkage: Linkage) -> Iterable[Condition]:
-        """Yields conditions on the arm's joints, without those of parts within."""
+        """Yields conditions on the arm's joints."""
         return ()
 
     jump_ts = default(lambda self: jumps_of(dict(_within(self))))
@@ -204,7 +198,6 @@ class Part(Frozen, metaclass=_Fields):
         return reduce(and_, [*own, *fields, *parts], True)
 
     def __repr__(self) -> str:
-        """Shows arguments on one line; long and traced arrays by their shape."""
         try:
             values = self.arguments()
         except (TypeError, ValueError):  # traced, of a batch, or not told
@@ -299,10 +292,7 @@ def sized(part: _Part, joints: int) -> _Part:
 
 
 def check_joints(place: str, part: Part, linkage: Linkage) -> None:
-    """Raises ValueError unless arrays and known values suit the arm's joints.
-
-    The number of joints is a shape, and so known while values are traced.
-    """
+    """Raises ValueError unless arrays and known values suit the arm's joints."""
     part, linkage = in_numpy((part, linkage))
     count = joints_of(linkage)
     for name, value, rules in _declared(part):
@@ -343,7 +333,7 @@ def table_over_times(part: Part, name: str, least: int) -> Iterator[Condition]:
 
 
 def jumps_at(name: str, part: Part) -> Array | None:
-    """Returns the times at which a part jumps, one or several (time,) [s], or None.
+    """Returns the times at which a part jumps (time,) [s], or None.
 
     Raises ValueError unless they are real numbers.
     """
@@ -363,10 +353,8 @@ def jumps_of(parts: dict[str, Part]) -> Array | None:
 
 
 def has_come(time: Array, t: Array | np.ndarray) -> Array:
-    """Returns whether a known time has come at `t`, or is later by rounding alone.
-
-    A run that ends at `t` and one that begins there agree on it.
-    """
+    """Returns whether a known time has come at `t`, or is later by rounding alone."""
+    # A run that ends at `t` and one that begins there agree on it.
     return time - 2 * jnp.finfo(time.dtype).eps * abs(time) <= t
 
 

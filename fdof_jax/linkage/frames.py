@@ -37,28 +37,28 @@ def unit_vector(angle: Array) -> Array:
 
 
 def dot(a: Array, b: Array) -> Array:
-    """Computes the dot product of two vectors of the plane."""
     return a.real * b.real + a.imag * b.imag
 
 
 def cross(a: Array, b: Array) -> Array:
-    """Computes the cross product of two vectors of the plane."""
     return a.real * b.imag - a.imag * b.real
 
 
 def length_of(vector: Array) -> Array:
-    """Length of a vector; 0 with derivative 0 for the zero vector, NaN for NaN."""
+    """Computes a vector's length, with derivative 0 for the zero vector."""
     square = dot(vector, vector)
     meet = square == 0
     return jnp.where(meet, 0, jnp.sqrt(jnp.where(meet, 1, square)))
 
 
 class Frames(NamedTuple):
-    """The ground (0) and the moving links (1 to n), in the last axis of arrays.
+    """The ground (0) and the moving links (1 to n), along the last axis of each array.
 
-    - `start`: characteristic points x + iy [m]; `direction`: unit vectors (..., n + 1).
-    - `angle`: absolute angles [rad]; `slide`: B_k of joints 1 to n [m].
-    - `revolute`: whether the joint before each moving link is revolute (n,).
+    - `start`: characteristic points x + iy (..., n + 1) [m].
+    - `direction`: unit vectors along the links (..., n + 1).
+    - `angle`: absolute angles (..., n + 1) [rad].
+    - `slide`: B_k of the joints (..., n) [m].
+    - `revolute`: whether each joint is revolute (..., n).
     """
 
     start: Rows
@@ -85,11 +85,11 @@ def frames(linkage: Linkage, q: Array) -> Frames:
 
 
 def link_frames(linkage: Linkage, q: ArrayLike) -> Frames:
-    """Computes where the links are along a motion, for pictures and measurements.
+    """Computes where the links are along a motion.
 
     **Arguments:** `linkage`; `q`: joint positions (time, n) [m or rad].
 
-    **Returns:** `Frames` in NumPy, with an axis of times before the others.
+    **Returns:** `Frames` in NumPy, with times along the first axis.
 
     **Raises:** ValueError for malformed arguments and within JAX's transformations.
     """
@@ -109,10 +109,8 @@ def _frames_of_each(linkage: Linkage, q: Array) -> Frames:
 
 
 def scalar_frames(linkage: Linkage, q: tuple[Array, ...] | Array) -> Frames:
-    """Computes the frames as lists of scalars, which fuse with the equations of motion.
-
-    A sweep with a spring takes 1.3 times as long with the arrays of `frames`.
-    """
+    """Computes the frames as lists of scalars, which fuse with the equations."""
+    # A sweep with a spring takes 1.3 times as long with the arrays of `frames`.
     revolute = real_joints(linkage.ef)
     angle, slide, direction = [linkage.base_angle], [], []
     start = [jnp.zeros((), complex)]

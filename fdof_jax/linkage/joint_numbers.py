@@ -1,4 +1,4 @@
-"""Joints by their numbers, from 1, as elements at some joints are given them."""
+"""Joints by their numbers, from 1."""
 
 from typing import Any
 
@@ -15,10 +15,7 @@ _NUMBERS = tuple(range(1, MOST_PAIRS + 1))
 
 
 def numbered(joints: Any) -> Array:
-    """Returns whether each number of a joint is among those given.
-
-    Raises ValueError for what are no numbers of joints.
-    """
+    """Returns a mask of the joints with the given numbers, or raises ValueError."""
     check_known("joints", joints)
     given: Any = joints
     try:
@@ -37,11 +34,11 @@ def numbered(joints: Any) -> Array:
 
 
 def among_joints(joints: Array, linkage: Linkage) -> Condition:
-    """Returns the condition that an arm has the joints that are marked."""
+    """Returns the condition that an arm has all joints of a mask."""
     count, last = joints_of(linkage), (joints * np.array(_NUMBERS)).max()
     return Condition(last <= count, "joints", f"1 to {count}", last)
 
 
 def numbers_in(joints: Array) -> np.ndarray:
-    """Returns the numbers of the joints that are marked, as `numbered` marks them."""
+    """Returns the numbers of the joints of a mask."""
     return np.array([number for number, marked in zip(_NUMBERS, joints) if marked])

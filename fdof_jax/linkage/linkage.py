@@ -1,10 +1,4 @@
-"""The linkage: its joints and its links.
-
-Pair k of the chain P-R-P-R-... joins link k to link k + 1. Its prismatic joint slides
-by B_k across link k; its revolute joint is at the start of link k + 1. Link 1 is the
-ground. One joint of each pair is real; the other is fictitious and held at its initial
-value. In a fixed pair both are fictitious.
-"""
+"""The linkage: its joints and its links."""
 
 import functools
 import inspect
@@ -36,15 +30,15 @@ from .topology import check_angles, fixed_pairs, letters, pairs_of, real_joints
 
 
 class Linkage(Frozen):
-    """A planar chain of moving links, as in Fig 1 of the paper.
+    """A planar chain of n moving links, 1 to 8, as in Fig 1 of the paper.
 
-    The paper's chain has three pairs of joints; a linkage has n, from 1 to 8. Link k
-    starts at its characteristic point. Its vector A_k runs along the link. The slide
-    B_k of the next prismatic joint is perpendicular to A_k (90 degrees
-    counter-clockwise). The mass centre lies p_k along and q_k across the link. Every
-    field is an array: linkages of different topologies share one compilation and can be
-    stacked into a batch. Fixed pairs give chains of different lengths the same shapes.
-    `replace(mass=...)` returns a checked copy with other values.
+    Pair k has a prismatic joint, then a revolute one. At most one of them is real; a
+    fictitious joint stands still. Link 1 is the ground; each other link starts at its
+    revolute joint. The vector A_k runs along link k; the slide B_k of the next
+    prismatic joint is perpendicular to it, 90 degrees counter-clockwise.
+
+    Every field is an array, so linkages of different topologies share one compilation
+    and can be stacked into a batch. `replace(mass=...)` returns a checked copy.
 
     **Arguments:**
 
@@ -52,18 +46,17 @@ class Linkage(Frozen):
       "RPR"; or two existence factors per pair. Stored as `ef` (2n,); the attribute
       `topology` has the letters.
     - `length`: A1, A2, ... of the ground and the moving links (n + 1,) [m].
-    - `com`: (p, q) of each moving link (n, 2) [m].
-    - `mass`: masses of the moving links (n,) [kg].
-    - `inertia`: moments of inertia about the mass centres (n,) [kg m^2].
-    - `locked`: position of the fictitious joint of each pair (n,): B_k [m] where the
-      real joint is revolute, th_{k+1} - th_k [rad] elsewhere.
-    - `base_angle`: th1, the angle of the ground's vector A1 [rad].
+    - `com`: mass centres, along and across each moving link (n, 2) [m].
+    - `mass`: of the moving links (n,) [kg].
+    - `inertia`: about the mass centres (n,) [kg m^2].
+    - `locked`: where fictitious joints stand (n,): B_k [m] beside a revolute joint,
+      th_{k+1} - th_k [rad] elsewhere.
+    - `base_angle`: th1, the angle of A1 [rad].
     - `gravity`: acceleration along -y [m/s^2].
 
-    **Raises:** ValueError for malformed input and for linkages in which some joint
-    moves no inertia in any configuration. Warns if the mass matrix may be singular in
-    some configuration, and if one of two joints is redundant (the paper's rules (i) and
-    (ii)).
+    **Raises:** ValueError for malformed arguments, and if a joint moves no inertia in
+    any configuration. Warns if the mass matrix may be singular in some, and of
+    redundant joints (the paper's rules (i) and (ii)).
 
     >>> import fdof_jax as fj
     >>> pendulum = fj.Linkage("RRR", length=[0, 1, 1, 1], com=[[1, 0]] * 3,
@@ -124,7 +117,6 @@ class Linkage(Frozen):
         return letters(self.ef)
 
     def __repr__(self) -> str:
-        """Shows the values of a single linkage, or the shapes of a batch."""
         if np.ndim(self.ef) != 1 or not known(self):
             return super().__repr__()
         _, *fields = vars(self).items()
@@ -142,7 +134,7 @@ def short(value: Array | np.ndarray) -> str:
 
 
 def joint_names(linkage: Linkage) -> list[str]:
-    """Returns the names of the joints in order, for instance R1, P2, F3.
+    """Returns the names of the joints in order, such as R1, P2, F3.
 
     **Raises:** ValueError if `linkage` is not a linkage.
     """
@@ -165,15 +157,13 @@ def joints_of(linkage: Linkage) -> int:
 
 
 def per_joint(name: str, values: ArrayLike, linkage: Linkage) -> Array | np.ndarray:
-    """Returns values as an array with one per joint, (n,).
+    """Returns one value per joint as an array (n,), of NumPy or JAX.
 
-    It stays in NumPy unless it is traced, or JAX's already: programs take it in a
-    fortieth of the time in which JAX makes an array of its own.
+    **Arguments:** `name`: the argument's name, for messages; `values`: such as joint
+    positions [m or rad].
 
-    **Arguments:** `name`: of the argument, for messages; `values`: for instance joint
-    positions [m or rad]; known ones named "q" that look like degrees bring a warning.
-
-    **Raises:** ValueError for all but n finite real numbers.
+    **Raises:** ValueError for all but n finite real numbers. Warns of known values
+    named "q" that look like degrees.
     """
     instance("linkage", linkage, Linkage)
     n = joints_of(linkage)
@@ -182,6 +172,7 @@ def per_joint(name: str, values: ArrayLike, linkage: Linkage) -> Array | np.ndar
             f"{name}: expected numbers for {n} joints at one instant (use jax.vmap for "
             f"many), got shape {np.shape(values)}."
         )
+    # Programs take NumPy's array in a fortieth of the time in which JAX makes its own.
     array = real_numbers(name, values, (n,), of=f"{n} joints")
     if name.rpartition(".")[2] == "q":  # positions, also those of a state
         check_angles(name, array, linkage.ef)
@@ -201,11 +192,9 @@ def compiled(
 ) -> Callable[[Callable[..., _T]], Callable[..., _T]]:
     """Decorates a function of a linkage and arrays: checks arguments, then compiles.
 
-    `joint_values` names arguments with a value per joint, which are ignored at fixed
-    pairs. Each keyword names an argument and gives the shape of its array, or a
-    function of linkage and argument that checks and converts it. The decorated function
-    accepts anything that converts to such an array. Without compilation, a call outside
-    of `jax.jit` would dispatch hundreds of single operations.
+    `joint_values` names arguments with a value per joint. Each keyword names another
+    argument, and gives the shape of its array or a function of linkage and argument
+    that checks and converts it.
     """
 
     def decorate(function: Callable[..., _T]) -> Callable[..., _T]:
@@ -242,10 +231,7 @@ def compiled(
 
 
 def check_linkage(linkage: object) -> None:
-    """Raises ValueError unless the argument is one linkage, not a batch.
-
-    Shapes and values are checked again: `equinox.tree_at` bypasses the constructor.
-    """
+    """Raises ValueError unless the argument is one valid linkage, not a batch."""
     if not isinstance(linkage, Linkage):
         raise ValueError(f"linkage: expected a Linkage, got {shown(linkage)}.")
     if jnp.ndim(linkage.ef) != 1:
@@ -254,6 +240,7 @@ def check_linkage(linkage: object) -> None:
             f"factors of shape {jnp.shape(linkage.ef)}."
         )
     n = joints_of(linkage)
+    # `equinox.tree_at` bypasses the constructor.
     shapes = (2 * n,), (n + 1,), (n, 2), (n,), (n,), (n,), (), ()
     for (name, value), shape in zip(vars(linkage).items(), shapes, strict=True):
         if np.shape(value) != shape:
@@ -273,11 +260,9 @@ def check_linkage(linkage: object) -> None:
 
 
 def possible(linkage: Linkage) -> Array:
-    """Returns whether the constructor would accept the values; works on traced ones.
+    """Returns whether the constructor would accept the values, known or traced.
 
-    Checks that existence factors are 0 or 1, with one real joint at most in each pair,
-    that the chain can move, and that masses and inertias are not negative. Singular
-    mass matrices are not checked.
+    It does not look for singular mass matrices.
     """
     pairs = linkage.ef.reshape(-1, 2)
     factors = ((pairs == 0) | (pairs == 1)).all() & (pairs.sum(axis=1) <= 1).all()

@@ -27,8 +27,7 @@ class Numbers(NamedTuple):
 def _frames(linkage: Numbers, q: np.ndarray) -> tuple[np.ndarray, ...]:
     """Computes starts and directions of the links, and mass centres, all as x + iy.
 
-    Of the plain arrays of a constructor, which compiles nothing, and in double
-    precision also where JAX has none; all else uses `frames`.
+    Unlike `frames` it compiles nothing, and always has double precision.
     """
     revolute = np.stack(real_joints(linkage.ef))
     summed = lambda parts: np.insert(np.cumsum(parts, axis=-1), 0, 0, axis=-1)
@@ -41,10 +40,9 @@ def _frames(linkage: Numbers, q: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def _scaled_inertia(linkage: Numbers) -> np.ndarray:
-    """Computes mass matrices at five random configurations (5, n, n).
+    """Computes mass matrices at five random configurations, scaled (5, n, n).
 
-    Scaling to a diagonal of ones makes them free of units and sizes; it is 0 where a
-    joint moves nothing, and 1 at fixed pairs.
+    The diagonal is 1, or 0 where a joint moves nothing.
     """
     linkage = Numbers(*(a.astype(float) for a in linkage))
     revolute = np.stack(real_joints(linkage.ef))
@@ -83,9 +81,9 @@ def check_singularity(linkage: Numbers) -> None:
                 line = " along the same line" if alike else ""
                 raise ValueError(
                     f"mass, inertia, com: expected joints {joints} of {names} to move "
-                    "some inertia however they move together, got joints that can move "
-                    f"against each other{line} and move none, in any configuration: "
-                    "their accelerations are undetermined."
+                    "some inertia whenever they move, got joints that can move against "
+                    f"each other{line} and move none, in any configuration: their "
+                    "accelerations are undetermined."
                 )
             raise ValueError(
                 f"mass, inertia, com: expected joint {k + 1} ({kind}) of {names} to "

@@ -18,10 +18,7 @@ _FACTORS = {"P": (1, 0), "R": (0, 1), "F": (0, 0)}
 
 
 def real_joints(ef: Array | np.ndarray) -> tuple[Array, ...]:
-    """Returns whether the real joint of each pair is revolute.
-
-    The first axis of `ef` holds the existence factors.
-    """
+    """Returns whether each pair turns; the first axis of `ef` has existence factors."""
     return tuple(ef[k] > 0.5 for k in range(1, len(ef), 2))
 
 
@@ -32,7 +29,7 @@ def check_angles(name: str, values: ArrayLike, ef: ArrayLike) -> None:
 
 
 def fixed_pairs(ef: Array | np.ndarray) -> tuple[Any, ...]:
-    """Returns whether both joints of each pair are fictitious, so that it is fixed."""
+    """Returns whether each pair is fixed: both of its joints are fictitious."""
     ef = ef if is_traced(ef) else np.asarray(ef)  # whose entries cost no calls of JAX
     return tuple(ef[k - 1] + ef[k] < 0.5 for k in range(1, len(ef), 2))
 
@@ -89,9 +86,9 @@ def existence_factors(topology: str) -> Float[Array, " factor"]:
     """Returns the existence factors of a topology, equation (4): EF1, EF2, ...
 
     Each pair is (prismatic, revolute), with 1 for a real joint and 0 for a fictitious
-    one: "RPR" gives 0, 1, 1, 0, 0, 1. A fixed pair, F, is (0, 0).
+    one. A fixed pair, F, is (0, 0).
 
-    **Arguments:** `topology`: up to eight letters R, P or F, as for a `Linkage`.
+    **Arguments:** `topology`: up to eight letters R, P or F.
 
     **Raises:** ValueError for any other name.
 
@@ -106,10 +103,7 @@ def existence_factors(topology: str) -> Float[Array, " factor"]:
 
 
 def names_and_units(ef: Array | np.ndarray) -> tuple[list[str], list[str]]:
-    """Returns names and units of joints; both are neutral if a batch mixes the kinds.
-
-    `ef` holds known existence factors, of one arm or of a batch.
-    """
+    """Returns names and units of joints, both neutral where a batch mixes the kinds."""
     names, units = [], []
     of_members = np.asarray(ef).reshape(-1, ef.shape[-1])
     for k, kinds in enumerate(map(set, zip(*map(letters, of_members)))):
@@ -120,10 +114,8 @@ def names_and_units(ef: Array | np.ndarray) -> tuple[list[str], list[str]]:
 
 
 def common_unit(units: list[str]) -> str:
-    """Returns the unit of a variable over joints that have these units."""
     return units[0] if len(set(units)) == 1 else "m or rad"
 
 
 def rate_unit(unit: str) -> str:
-    """Returns the unit of a velocity from that of the position."""
     return " or ".join(f"{one}/s" for one in unit.split(" or "))

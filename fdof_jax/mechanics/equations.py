@@ -1,13 +1,6 @@
-"""The reduced equations of motion of a chain of any number of joints, in scalars.
+"""The reduced equations of motion of a chain of joints, in scalars.
 
-The equations use scalars, never stacked arrays, because XLA on CPU computes a stacked
-result once per entry. Positions are displacements from a reference configuration, which
-turn the reference's directions. A pendulum 1e-17 rad away from upright therefore keeps
-that angle, which upright + 1e-17 would lose, and an arm that starts after a million
-turns moves as it would have before. The algebra is a composite-body recursion from the
-tip. For three joints it is S(EF)^T M S(EF) of the paper's six equations, without
-forming them. Per joint, the existence factors select between turning about a point and
-sliding along a direction; at a fixed pair, displacement and rate are zero.
+For three joints they are S(EF)^T M S(EF) of the paper's six.
 """
 
 import dataclasses
@@ -25,6 +18,13 @@ from ..base.checks import concrete
 from ..base.trigonometry import sincos
 from ..linkage.linkage import Linkage
 from ..linkage.topology import fixed_pairs, real_joints
+
+# Scalars, because XLA on CPU computes a stacked result once per entry. Positions are
+# displacements from a reference, whose directions they turn: a pendulum 1e-17 rad away
+# from upright keeps that angle, and an arm that starts after a million turns moves as
+# before. The algebra is a composite-body recursion from the tip. Existence factors
+# select between turning about a point and sliding along a direction; at a fixed pair,
+# displacement and rate are zero.
 
 Scalars = tuple[Array, ...]
 Vector = tuple[Array, Array]
@@ -55,19 +55,18 @@ class Constants(NamedTuple):
     """Scalars of a linkage for the equations, computed once per solve.
 
     Each tuple has an entry per pair of joints, k, or per link that follows. Flags are
-    `Known` where a program contains them, and constants with these are other trees.
+    `Known` where a program contains them.
 
     - `revolute`, `fixed`: whether the pair turns; whether it neither turns nor slides.
     - `direction`: of the ground and of each link at the reference.
     - `slide`: B_k at the reference [m].
-    - `carried`: mass of the link and of all links beyond [kg].
-    - `along`: from the link's start along it to the next slide [m]; none for the last.
-    - `moment`: first moment along and across the link [kg m], with the mass beyond it
-      at the end of `along`; `second`: second moment about the link's start [kg m^2].
+    - `carried`: mass of the link and all beyond [kg].
+    - `along`: from the link's start to the next slide [m]; none for the last.
+    - `moment`: first moment along and across the link [kg m], with the mass beyond at
+      the end of `along`; `second`: second moment about the link's start [kg m^2].
     - `ends_in_slides`: whether the pair slides and one pair beyond it moves, a slide.
-    - `slide_pivot`: the inertia [kg] of the first of these slides while the other is
-      free; m34 - m4 cos^2 of the angle between them would cancel at small angles, so
-      it is m3 + m4 sin^2.
+    - `slide_pivot`: inertia [kg] of the first of these slides with the other free: m3 +
+      m4 sin^2 of the angle between them, as m34 - m4 cos^2 would cancel.
     """
 
     revolute: tuple[Flag, ...]
@@ -88,17 +87,14 @@ def link_constants(
     q: Float[Array, " joint"],
     sincos: Callable[[Array], tuple[Array, Array]] = sincos,
 ) -> Constants:
-    """Computes the scalars that `rates` needs, with `q` as reference.
-
-    `sincos` may be one for large angles. Directions are combined instead of angles,
-    because the sum of large angles is rounded.
-    """
+    """Computes the scalars that `rates` needs, with `q` as reference."""
     revolute, fixed, ends_in_slides = _flags(linkage.ef)
     turns = jnp.stack(real_joints(linkage.ef))
     q = jnp.where(jnp.stack(fixed_pairs(linkage.ef)), 0, q)
     angle = jnp.where(turns, q, linkage.locked)
     sin, cos = sincos(jnp.concatenate([linkage.base_angle[None], angle]))
     ground, *turned = zip(cos, sin)
+    # Directions are combined, because a sum of large angles is rounded.
     direction = [ground]
     for turn in turned:
         direction.append(_in_frame(*turn, direction[-1]))
@@ -149,12 +145,10 @@ def _flags(ef: Array | np.ndarray) -> tuple[tuple[Flag, ...], ...]:
 
 
 def with_held(c: Constants, held: Scalars) -> Constants:
-    """Returns the constants with the joints that are held as fixed pairs.
-
-    A slide whose one slide beyond is held has the pivot of a single one.
-    """
+    """Returns the constants with held joints as fixed pairs."""
     either = lambda pair, own: where(pair, jnp.ones_like(own), own)
     ends = list(c.ends_in_slides)
+    # A slide whose one slide beyond is held has the pivot of a single one.
     for k in range(len(ends)):
         for own in held[k + 1 :]:
             ends[k] = where(ends[k], ~own, jnp.zeros_like(own))
@@ -230,9 +224,6 @@ def equations(
     """Computes the equations of motion: (8)-(13) projected on the real joints.
 
     `turned`: the `directions` at `delta`, if the caller has them.
-
-    Rates that are nearly equal do not cancel: squares of the links' angular velocities
-    enter the moments about a joint as differences, which are products with joint rates.
     """
     r, joints, last = c.revolute, range(len(delta)), len(delta) - 1
     zero = jnp.zeros_like(delta[0])
@@ -247,6 +238,7 @@ def equations(
     # While all joints keep their rates: accelerations of the links' starts, from the
     # base outwards, upwards by gravity. A joint's rate adds w_k^2 - w_(k-1)^2 to the
     # angular velocity squared, or half of it as the Coriolis acceleration of a slide.
+    # Differences of nearly equal squares would cancel; these products do not.
     gained = [None, *(qd[k] * (w[k - 1] + w[k]) for k in joints[1:])]
     coriolis = [None, *(where(r[k], zero, gained[k]) for k in joints[1:])]
     start = [(jnp.zeros_like(c.gravity), c.gravity)]

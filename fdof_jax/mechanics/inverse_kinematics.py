@@ -18,30 +18,26 @@ from .equations import Scalars
 
 
 def whole_turns(angle: Array) -> Array:
-    """Returns the number of turns to subtract from `angle` for a value in (-pi, pi].
-
-    The cut lies beside the negative x axis by more than rounding, so that points on
-    that axis are always at +pi.
-    """
+    """Returns the number of turns to subtract from `angle` for a value in (-pi, pi]."""
+    # The cut lies beside the negative x axis, so that points on it are always at +pi.
     margin = float(np.sqrt(np.finfo(angle.dtype).eps))
     return jnp.ceil((angle - np.pi - margin) / (2 * np.pi))
 
 
 class Arm(NamedTuple):
-    """Three joints and what is between them, as the closed form sees a linkage.
+    """Three joints and the rigid parts between them, as the closed form sees a linkage.
 
-    Vectors are x + iy. Those of links are in the frame of the link before the joint at
-    their end, and go from joint to joint; a joint's own slide counts as 0.
+    Vectors x + iy go from joint to joint, in the frame of the link before the joint at
+    their end. A joint's own slide counts as 0.
 
     - `revolute`: whether the joints turn; `locked`: by how much slides turn [rad].
-    - `links`: vectors from the first joint to the second and the third (2,) [m].
-    - `angle`, `direction`: angles (4,) [rad] and unit vectors (4,) of the ground and
-      the three links, without what depends on the tip's position: those of links 2 and
-      3 follow from the ground or from the last link, or are arbitrary.
-    - `ends`: vectors of the ground to the first joint and from the third to the tip
-      (2,), which no joint moves [m].
-    - `place`: places of the joints among those of the linkage (n,), None if it has no
-      others. `offset`: what positions have beyond those in the linkage [m or rad].
+    - `links`: from the first joint to the second, and on to the third (2,) [m].
+    - `angle`, `direction`: of the ground and the three links (4,) [rad], as far as they
+      do not depend on the tip's position.
+    - `ends`: from the ground to the first joint, and from the third to the tip (2,)
+      [m].
+    - `place`: indices of the joints in the linkage, None if it has no others.
+    - `offset`: what positions have beyond those in the linkage [m or rad].
     - `valid`: zeros (n,), or NaN if another number of joints moves, or none turns.
     """
 
@@ -57,10 +53,7 @@ class Arm(NamedTuple):
 
     @property
     def base(self) -> Array:
-        """The part of the tip's position that is not the wrist's [m].
-
-        The wrist vector goes from the first joint's start to the last link's.
-        """
+        """The tip's position without the vector from first joint to last link [m]."""
         return self.ends[0] * self.direction[0] + self.ends[1] * self.direction[3]
 
     def placed(self, q: Array) -> Array:
@@ -75,8 +68,7 @@ class Arm(NamedTuple):
 def check_moving_joints(linkage: Linkage, oriented: bool) -> None:
     """Raises ValueError unless three joints move, or two without an orientation.
 
-    Slides alone orient nothing. Of traced existence factors, only their number is
-    checked.
+    Of traced existence factors only the number is checked.
     """
     wanted, n, traced = 2 + oriented, joints_of(linkage), is_traced(linkage.ef)
     count = n if traced else int(np.asarray(linkage.ef).sum())
@@ -98,8 +90,8 @@ def check_moving_joints(linkage: Linkage, oriented: bool) -> None:
 def arm_of(linkage: Linkage, orientation: Array | float | None) -> Arm:
     """Returns a linkage as an arm of three joints whose last link has an orientation.
 
-    Without one, two joints move, and a third one that turns at the tip takes any
-    direction. If another number of joints moves, or none turns, all positions are NaN.
+    Without one, two joints move, and a third turns freely at the tip. Positions of
+    other arms are NaN.
     """
     oriented, n = orientation is not None, joints_of(linkage)
     check_moving_joints(linkage, oriented)
@@ -153,19 +145,15 @@ def solve_joints(
 ) -> tuple[Array, Array, Array]:
     """Computes positions of a linkage (n,) from the wrist x + iy, NaN out of reach.
 
-    The second result is a root that is 0 just at the edge of the reach, or beyond it by
-    rounding. Velocities are not finite there. The third is how far the wrist is beyond
-    the edge [m]: negative within reach, infinite for two parallel slides.
-
-    `bearing` is the direction angle of `wrist`. As an argument it can be continuous
-    along a path that winds around the pivot.
-
-    The vectors of links 2 and 3 and the slides add up to the wrist vector. Two of these
-    parts are unknown, in three kinds: two vectors of known lengths (RRR), one vector of
-    known length and one slide of known direction (RRP, PRR, and RPR as seen from link
-    2, where the wrist vector turns), two slides (PPR, RPP, PRP). The first two kinds
-    need a square root, whose sign is the branch.
+    Also returns a root, 0 at the edge of the reach, and how far the wrist is beyond the
+    edge [m]: negative within reach, infinite for two parallel slides. `bearing`, the
+    angle of `wrist`, may be continuous along a path that winds around the pivot.
     """
+    # The vectors of links 2 and 3 and the slides add up to the wrist vector. Two of
+    # these parts are unknown, in three kinds: two vectors of known lengths (RRR), one
+    # vector of known length and one slide of known direction (RRP, PRR, and RPR as seen
+    # from link 2, where the wrist vector turns), two slides (PPR, RPP, PRP). The first
+    # two kinds need a square root, whose sign is the branch.
     r1, r2, r3 = arm.revolute
     # Which vectors turn by themselves: link 2's, link 3's, or the wrist's as a whole.
     turning2, turning3, whole = r1 & r2, r2 & r3, r1 & r3
@@ -233,7 +221,7 @@ def solve_joints(
 
 
 def beyond(missing: Array) -> str:
-    """Says in messages by how much a point or a path is out of reach."""
+    """Says in messages how far a point or a path is out of reach."""
     farthest = np.asarray(missing).max()
     if farthest == np.inf:
         return ", and two slides that are parallel"
@@ -246,29 +234,28 @@ def inverse_kinematics(
 ) -> Float[Array, " joint"]:
     """Computes joint positions for a tip position and a direction of the last link.
 
-    The closed form covers every topology of three moving joints, at least one of which
-    turns, and of two if no orientation is commanded. Existence factors select the case;
-    fixed pairs may be anywhere. The direction from the first joint to the last link's
-    start is in (-pi, pi]; the angles follow from it without wrapping.
+    The closed form takes three moving joints, at least one of which turns, or two
+    without an orientation. Fixed pairs may be anywhere. The direction from the first
+    joint to the last link's start is in (-pi, pi]; the angles follow from it without
+    wrapping.
 
     **Arguments:**
 
     - `tip`: the point (x, y) [m].
-    - `orientation`: the absolute angle of the last link [rad], th4 in the paper; None
-      for an arm of two joints.
-    - `branch`: 1 or -1, the choice between two assemblies: the sign of the turn from A2
-      to A3 (RRR), of the slide measured from the foot of the perpendicular (RPR), or of
-      the side of the turning vector (PRR, RRP). Two joints count as with a third that
-      turns at the tip. Ignored where there is only one assembly.
+    - `orientation`: th4, the absolute angle of the last link [rad]; None for two
+      joints.
+    - `branch`: 1 or -1, one of two assemblies. It is the sign of the turn from A2 to A3
+      (RRR), of the slide from the foot of the perpendicular (RPR), or of the side of
+      the turning vector (PRR, RRP). Two joints count as with a third that turns at the
+      tip. Ignored where there is only one assembly.
 
-    **Returns:** `q` [m or rad], 0 at fixed pairs; NaN for traced arguments if the point
-    is out of reach. A point beyond the reach by rounding counts as on its edge, where
-    the two assemblies meet and derivatives in the point are not finite. Near the edge,
-    joints move as the root of the distance from it: a point known to 1e-16 m may give
-    joints known to 1e-8 rad.
+    **Returns:** `q` (n,) [m or rad], 0 at fixed pairs; NaN for traced arguments if the
+    point is out of reach. A point beyond the reach by rounding counts as on its edge,
+    where the assemblies meet and derivatives are not finite. Near the edge, a point
+    known to 1e-16 m gives joints known to 1e-8 rad.
 
-    **Raises:** ValueError for malformed arguments, for a linkage of another number of
-    joints or of three slides, and for concrete arguments if the point is out of reach.
+    **Raises:** ValueError for malformed arguments, another number of moving joints,
+    three slides, and a known point out of reach.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig7().linkage

@@ -19,9 +19,9 @@ def joint_positions(
 ) -> Float[Array, "joint 2"]:
     """Computes the revolute axis of each joint pair, where the next link starts.
 
-    **Arguments:** `q`: joint positions [m or rad].
+    **Arguments:** `q` [m or rad].
 
-    **Returns:** one point (x, y) per joint [m], from the ground pivot.
+    **Returns:** points (x, y) from the ground pivot (n, 2) [m].
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
@@ -35,9 +35,9 @@ def joint_positions(
 def mass_centers(linkage: Linkage, q: Float[Array, " joint"]) -> Float[Array, "link 2"]:
     """Computes the mass centres of the moving links.
 
-    **Arguments:** `q`: joint positions [m or rad].
+    **Arguments:** `q` [m or rad].
 
-    **Returns:** one point (x, y) per moving link [m], from the ground pivot.
+    **Returns:** points (x, y) from the ground pivot (n, 2) [m].
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
@@ -52,12 +52,7 @@ def mass_centers(linkage: Linkage, q: Float[Array, " joint"]) -> Float[Array, "l
 def mass_center_velocities(
     linkage: Linkage, q: Float[Array, " joint"], qd: Float[Array, " joint"]
 ) -> tuple[Float[Array, "link 2"], Float[Array, " link"]]:
-    """Computes velocities of the mass centres and angular velocities of the links.
-
-    **Arguments:** `q`: joint positions [m or rad]; `qd`: rates [m/s or rad/s].
-
-    **Returns:** one velocity (x, y) [m/s] and one angular velocity [rad/s] per link.
-    """
+    """Computes mass centres' velocities [m/s] and links' angular velocities [rad/s]."""
     _, e, _, slide, revolute = frames(linkage, q)
     turning = jnp.cumsum(jnp.where(revolute, qd, 0))
     rate = jnp.concatenate([jnp.zeros(1), turning])
@@ -72,9 +67,9 @@ def mass_center_velocities(
 def tip_position(linkage: Linkage, q: Float[Array, " joint"]) -> Float[Array, " 2"]:
     """Computes the tip's position: the end of the last link's vector A.
 
-    **Arguments:** `q`: joint positions [m or rad].
+    **Arguments:** `q` [m or rad].
 
-    **Returns:** the point (x, y) [m], from the ground pivot.
+    **Returns:** the point (x, y) from the ground pivot [m].
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
@@ -90,9 +85,9 @@ def tip_jacobian(
 ) -> Float[Array, "3 joint"]:
     """Computes the derivative of the tip's x, y and orientation in `q`.
 
-    **Arguments:** `q`: joint positions [m or rad].
+    **Arguments:** `q` [m or rad].
 
-    **Returns:** rows x, y [m or 1] and orientation [rad] per joint [m or rad].
+    **Returns:** rows x, y [m] and orientation [rad], per m or rad of each joint (3, n).
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage

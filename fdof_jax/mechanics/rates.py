@@ -1,8 +1,6 @@
 """The rates of a linkage's state for integrators, and their derivatives.
 
-XLA on CPU gives each result of an expression, and each division in it, its own loop
-over the batch, which evaluates the equations five times. Here one fused loop computes
-all results, also of derivatives.
+One fused loop computes all; XLA on CPU would evaluate the equations for each result.
 """
 
 import functools
@@ -265,8 +263,8 @@ def rates_and_conditioning(
 ) -> tuple[tuple[Scalars, Scalars], Scalars]:
     """Computes `rates` and the amplification of rounding errors in them.
 
-    The amplifications are 1 over the `inertia_ratios`, 0 at fixed pairs, infinite where
-    the mass matrix is not positive definite, and constant for derivatives.
+    It is 1 over the `inertia_ratios`, infinite where the mass matrix is not positive
+    definite, and constant for derivatives.
     """
     if len(delta) > _MOST_TOGETHER:
         values = fused(_rates)(c, delta, qd, tau, added)

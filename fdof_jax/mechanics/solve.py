@@ -59,10 +59,10 @@ def solver_of(
 ) -> tuple[Callable[[Scalars], Scalars], Callable[[], Scalars]]:
     """Returns a function that solves M x = f, and one for the diagonal of M^-1.
 
-    The factorisation is L^T D L from the tip, whose pivots are articulated inertias.
-    `m` already includes `added`. The diagonal is infinite if a pivot is not positive.
-    At fixed pairs x and the diagonal are zero.
+    `m` includes `added`. The diagonal is infinite if M is not positive definite. Fixed
+    pairs get zeros.
     """
+    # The factorisation is L^T D L from the tip; its pivots are articulated inertias.
     joints = range(len(m.bias))
     rest = [list(row) for row in m.mass]  # entry (i, j) is rest[i][j - i]
     pivots, inverse = [], []

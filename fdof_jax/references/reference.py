@@ -20,13 +20,12 @@ class Reference(Part):
     """A motion of the joints to follow: called as `(t, linkage) -> (q, qd)`.
 
     Positions and velocities have shape (n,) [m or rad; m/s or rad/s]. Plain functions
-    and other callables are accepted wherever a reference is expected. A subclass
-    implements `__call__`, or `assembly`; all else has a default:
+    are accepted wherever a reference is expected. A subclass implements `__call__`, or
+    `assembly`; all else has a default:
 
-    - `assembly(t, linkage)`: returns positions, and a root that is 0 at the edge of the
-      reach. The velocities are then the exact rates of the positions.
-    - `jump_ts`: a time at which the motion jumps, or a list of such times; steps end
-      there [s].
+    - `assembly(t, linkage)`: positions, and a root that is 0 at the edge of the reach.
+      The velocities are then the exact rates of the positions.
+    - `jump_ts`: one or several times [s] at which the motion jumps; steps end there.
     - `check(linkage, ts)`: raises ValueError if the arm cannot follow.
     - `tip(t)`: the commanded position of the tip (2,) [m]; by default None.
     - `period`: the time of one turn [s]; by default None.
@@ -52,13 +51,11 @@ class Reference(Part):
             )
 
     def assembly(self, t: Array, linkage: Linkage) -> tuple[Array, Array | float]:
-        """Returns positions (n,) [m or rad], and a root: 0 at the edge of the reach."""
         raise NotImplementedError  # found at construction
 
     def __call__(
         self, t: ArrayLike, linkage: Linkage
     ) -> tuple[Float[Array, " joint"], Float[Array, " joint"]]:
-        """Returns positions [m or rad] and velocities [per s] at time `t` [s]."""
         check_linkage(linkage)
         arguments = self, real_array("t", t, ()), linkage
         # Functions may hold traced values, which no program at once could have.
@@ -87,8 +84,8 @@ class ForeignReference(Foreign, Reference):
 def reference_of(value: Callable) -> Reference:
     """Returns a callable as a `Reference`, with the methods that a plain one lacks.
 
-    **Arguments:** `value`: a reference, or any callable `(t, linkage) -> (q, qd)`
-    [m or rad, and per second].
+    **Arguments:** `value`: any callable `(t, linkage) -> (q, qd)` [m or rad, and per
+    second].
 
     **Raises:** ValueError for anything else.
 
@@ -107,7 +104,7 @@ def reference_of(value: Callable) -> Reference:
 def reference_motion(
     reference: Callable, t: Array, linkage: Linkage
 ) -> tuple[Array, Array]:
-    """Positions and velocities of a reference, checked to be two arrays (n,)."""
+    """Returns a reference's positions and velocities, checked to be two arrays (n,)."""
     motion = reference(t, linkage)
     if not isinstance(motion, tuple) or len(motion) != 2:
         raise refusal("reference", "it to return (q_ref, qd_ref)", motion)
@@ -121,7 +118,7 @@ def reference_motion(
 
 @at_once
 def reach(reference: Callable, linkage: Linkage, times: Array) -> Array:
-    """Returns whether positions and velocities are finite at each of the times."""
+    """Returns whether positions and velocities are finite at each time."""
     motion = lambda t: jnp.concatenate(reference_motion(reference, t, linkage))
     # A loop compiles in three quarters of the time of `jax.vmap`.
     return jax.lax.map(lambda t: jnp.isfinite(motion(t)).all(), times)
@@ -132,11 +129,10 @@ def reachable(
 ) -> Bool[Array, " time"]:
     """Returns whether a linkage can reach the reference at each time.
 
-    A `TipTask` is out of reach at all times if it passes behind the pivot between the
-    first and the last time, because joints would jump there.
+    A `TipTask` that passes behind the pivot between the first and the last time is out
+    of reach at all times: joints would jump there.
 
-    **Arguments:** `linkage`; `reference`: for instance a `CircleTask` or `TipTask`;
-    `ts`: times (time,) [s].
+    **Arguments:** `linkage`; `reference`: such as a `TipTask`; `ts`: times (time,) [s].
 
     **Raises:** ValueError for malformed arguments.
 

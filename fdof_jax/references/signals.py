@@ -14,11 +14,11 @@ from .reference import Reference
 class Step(Reference):
     """A step of the joints' positions at a known time.
 
-    The reference velocity is 0: a derivative gain acts on the arm's velocity alone.
+    The velocity is 0: a derivative gain acts on the arm's velocity alone.
 
     **Arguments:** positions are one per joint, or one for all.
 
-    - `before`, `after`: the positions before the step, and from the step on [m or rad].
+    - `before`, `after`: the positions before the step, and from then on [m or rad].
     - `begin`: the time of the step [s].
 
     **Raises:** ValueError for malformed arguments.
@@ -39,7 +39,6 @@ class Step(Reference):
 
     @property
     def jump_ts(self) -> Array:
-        """The time of the step [s]."""
         return self.begin[None]
 
     def __call__(self, t: Any, linkage):
@@ -59,8 +58,8 @@ class Pulse(Reference):
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.double_pendulum().linkage
     >>> pulse = fj.references.Pulse(0.0, 0.2, begin=1.0, end=1.5)
-    >>> [pulse(t, arm)[0].tolist() for t in (0.9, 1.0, 1.5)]
-    [[0.0, 0.0], [0.2, 0.2], [0.0, 0.0]]
+    >>> [pulse(t, arm)[0].tolist() for t in (1.0, 1.5)]
+    [[0.2, 0.2], [0.0, 0.0]]
     """
 
     outside: Values = field(unit="m or rad")
@@ -74,7 +73,6 @@ class Pulse(Reference):
 
     @property
     def jump_ts(self) -> Array:
-        """The times at which the pulse begins and ends [s]."""
         return jnp.stack([self.begin, self.end])
 
     def __call__(self, t: Any, linkage):

@@ -52,7 +52,7 @@ class JointMove(Reference):
     travel: Travel = of_kind(Travel)
 
     def assembly(self, t: Array, linkage: Linkage) -> tuple[Array, float]:
-        """Returns positions, and 1 as the root: a joint move has no edge of a reach."""
+        """Returns positions, and 1: the reach has no edge."""
         return self.start + self.travel(t) * (self.end - self.start), 1.0
 
 
@@ -62,7 +62,7 @@ class SetPoint(Reference):
     **Arguments:** one per joint, or one for all.
 
     - `q`: positions [m or rad].
-    - `qd`: velocities, by default 0 [m/s or rad/s], for servos that take both.
+    - `qd`: velocities for servos that take both, by default 0 [m/s or rad/s].
 
     **Raises:** ValueError for malformed arguments.
 
@@ -97,27 +97,26 @@ class TipReference(Reference):
 
     @abstractmethod
     def wrist_seen(self, t: Array, base: Array) -> tuple[Array, Array]:
-        """Returns vectors x + iy from the first joint to the wrist, and their angles.
+        """Returns the vector x + iy from the first joint to the wrist, and its angle.
 
-        `base`: the rest of the vector to the tip. The angles are continuous in time.
+        The angle is continuous in time. `base`: the rest of the vector to the tip.
         """
 
     def assembly(self, t, linkage):
         return self.solved(t, linkage)[:2]
 
     def solved(self, t: Array, linkage: Linkage) -> tuple[Array, Array, Array]:
-        """Joint positions, their root, and by how much the wrist is beyond reach."""
+        """Returns what `solve_joints` does."""
         arm = arm_of(linkage, self.orientation)
         return solve_joints(arm, *self.wrist_seen(t, arm.base), self.branch)
 
     def __call__(
         self, t: ArrayLike, linkage: Linkage
     ) -> tuple[Float[Array, " joint"], Float[Array, " joint"]]:
-        """Returns positions [m or rad] and velocities [m/s or rad/s] at time `t` [s].
+        """Returns positions and velocities at time `t` [s].
 
-        Known arguments raise ValueError, and traced ones return NaN, where the tip is
-        out of reach or the arm has another number of joints. At the edge of the reach
-        the velocities are not finite.
+        Out of reach, known arguments raise ValueError and traced ones return NaN.
+        Velocities are not finite at the edge.
         """
         motion = super().__call__(t, linkage)
         if not (is_traced(motion) or np.isfinite(motion).all()):
@@ -131,7 +130,6 @@ class TipReference(Reference):
         return motion
 
     def _reach(self) -> str:
-        """Names the reach in messages."""
         commanded = self.orientation is not None
         at = f" at orientation {self.orientation:g} rad" if commanded else ""
         return f"the linkage's reach{at} on branch {self.branch:+g}"
@@ -149,12 +147,10 @@ def _missing(reference: TipReference, linkage: Linkage, times: Array) -> Array:
 def reach_margin(
     linkage: Linkage, task: TipReference, ts: ArrayLike
 ) -> Float[Array, " time"]:
-    """Computes how far the tip is within the edge of the reach [m].
+    """Computes how far the tip is within the reach at the task's orientation [m].
 
-    The reach is that of tips at the task's orientation. Out of reach, the margin is
-    minus the distance from the reach. With two slides the reach has no edge, and the
-    margin is infinite, or -inf if the slides are parallel. A search for lengths can use
-    the margin as a constraint.
+    Out of reach, the margin is minus the distance from it. With two slides the reach
+    has no edge: the margin is infinite, or -inf if they are parallel.
 
     **Arguments:** `linkage`; `task`: a `CircleTask` or a `TipTask`; `ts`: times (time,)
     [s].
@@ -177,22 +173,20 @@ def reach_margin(
 class TipTask(TipReference):
     """A path of the tip on which the last link keeps its angle.
 
-    A call with `(t, linkage)` returns the joint reference, computed by the closed-form
-    inverse kinematics and its exact rate. The wrist (where the last link starts) must
-    not cross the half-line from the ground pivot away from the path's middle: there the
-    angle of a turning arm would jump. `simulate` checks this.
+    A call with `(t, linkage)` returns the joint reference and its exact rate. The start
+    of the last link must not pass behind the ground pivot as seen from the path's
+    middle: a joint's angle would jump there.
 
     **Arguments:**
 
-    - `path`: a `Path`: `Line`, `Ellipse`, `FigureEight`, `Spline` or your own subclass.
+    - `path`: a `Path`, such as a `Line`.
     - `timing`: a `Travel` or `Laps`, or any function from time to the share of the way.
-    - `orientation`: the absolute angle of the last link [rad], th4 in the paper, by
-      default 0; None for an arm of two joints, whose last link turns as it must.
+    - `orientation`: th4, the absolute angle of the last link [rad]; by default 0, None
+      for an arm of two joints.
     - `branch`: assembly of the arm, 1 (default) or -1: see `inverse_kinematics`.
 
-    **Raises:** ValueError for malformed arguments. `check`, and so `simulate`, raises
-    ValueError for a path out of the linkage's reach; a call does where the tip is out
-    of reach.
+    **Raises:** ValueError for malformed arguments; in `simulate` and `check`, for a
+    path out of reach or behind the pivot; in a call, for a tip out of reach.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig7().linkage
@@ -214,11 +208,11 @@ class TipTask(TipReference):
         yield Condition(known, "path", f"{expected}, a point (x, y)", (self.path,))
 
     def tip(self, t: ArrayLike) -> Float[Array, " 2"]:
-        """The commanded tip position at time `t` [s]: (x, y) [m]."""
+        """Returns the commanded tip position (x, y) [m] at time `t` [s]."""
         return _tip(self, real_array("t", t, ()))
 
     def wrist_seen(self, t, base):
-        """The wrist and its angle, as the angle from the path's middle and its own."""
+        """Returns the wrist and its angle, counted from that of the path's middle."""
         wrist = plane_vectors(self.path.point(self.timing(t))) - base
         hub = plane_vectors(self.path.middle) - base
         middle = plane_angle(hub.imag, hub.real)
@@ -228,10 +222,8 @@ class TipTask(TipReference):
     def check(self, linkage: Linkage, ts: Array) -> None:
         """Raises ValueError if the tip leaves the reach or the wrist's angle jumps.
 
-        Both are checked at 1000 times or more between `ts[0]` and `ts[-1]`: during a
-        `Travel`, or during at most one lap of `Laps`. For another timing, 1000 times
-        span the run, and as many more lie where the share of the way changes between
-        these. The path of `Laps` has to be closed.
+        Both are checked at 1000 times or more between `ts[0]` and `ts[-1]`. The path of
+        `Laps` has to be closed.
         """
         super().check(linkage, ts)
         check_moving_joints(linkage, self.orientation is not None)
@@ -264,7 +256,7 @@ def _tip(task: TipTask, t: Array) -> Array:
 
 
 def _times(task: TipTask, ts: Array) -> Array:
-    """Returns times between the first and the last at which the path is checked."""
+    """Returns the times between the first and the last at which the path is checked."""
     timing, count = task.timing, _TIMES
     begin, end = ts[0], ts[-1]
     if isinstance(timing, Laps):  # all laps are alike
@@ -288,10 +280,7 @@ def _survey(task: TipTask, linkage: Linkage, ts: Array) -> tuple[Array, ...]:
 
 
 def _way(task: TipTask, linkage: Linkage, times: Array) -> tuple[Array, Array]:
-    """Returns whether the wrist never passes behind the pivot, and a gap [m].
-
-    The gap is between the end of a lap and its start, 0 without laps.
-    """
+    """Returns whether the wrist never passes behind the pivot, and a lap's gap [m]."""
     gap = jnp.zeros(())
     base = arm_of(linkage, task.orientation).base
     wrist = lambda t: task.wrist_seen(t, base)
@@ -306,28 +295,22 @@ def _way(task: TipTask, linkage: Linkage, times: Array) -> tuple[Array, Array]:
 class CircleTask(TipReference):
     """A circle traced by the tip at constant speed; the last link keeps its angle.
 
-    A call with `(t, linkage)` returns the joint reference, computed by the closed-form
-    inverse kinematics and its exact rate. The reference is continuous in time, even if
-    the path winds around the base, which no `TipTask` may do. At t = 0 it equals the
-    result of `inverse_kinematics`.
-
-    The circle of Fig 7 is not printed in the paper: the default is our choice. It lies
-    inside the reach of the figure's arm and starts 0.25 m from the arm's tip, because
-    the text mentions an initial offset.
+    A call with `(t, linkage)` returns the joint reference and its exact rate,
+    continuous in time even if the circle winds around the base, as no `TipTask` may. At
+    t = 0 it equals `inverse_kinematics`. The paper does not print the circle of Fig 7:
+    the default is our choice.
 
     **Arguments:**
 
     - `center`: (x, y) [m].
     - `radius`: not negative [m].
     - `period`: time of one turn, counter-clockwise if positive, not zero [s].
-    - `phase`: direction of the starting point as seen from the centre [rad]; pi by
-      default.
-    - `orientation`: th4, the absolute angle of the last link [rad]; pi/2 by default.
-    - `branch`: assembly of the arm, 1 or -1: see `inverse_kinematics`.
+    - `phase`: direction of the starting point from the centre [rad]; by default pi.
+    - `orientation`: th4, the absolute angle of the last link [rad]; by default pi/2.
+    - `branch`: assembly of the arm, 1 (default) or -1: see `inverse_kinematics`.
 
-    **Raises:** ValueError for malformed arguments. `check`, and so `simulate`, raises
-    ValueError for a circle out of the linkage's reach; a call does where the tip is out
-    of reach.
+    **Raises:** ValueError for malformed arguments; in `simulate` and `check`, for a
+    circle out of reach; in a call, for a tip out of reach.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig7().linkage
@@ -349,23 +332,21 @@ class CircleTask(TipReference):
         yield Condition(self.period != 0, "period", "not zero", (self.period,))
 
     def tip(self, t: ArrayLike) -> Float[Array, " 2"]:
-        """The commanded tip position at time `t` [s]: (x, y) [m]."""
+        """Returns the commanded tip position (x, y) [m] at time `t` [s]."""
         return _circle_tip(self, real_array("t", t, ()))
 
     def wrist_seen(self, t, base):
-        """The wrist and its angle, which starts within a turn.
-
-        The angle of the larger vector, to the centre or from there, is continuous. The
-        smaller one adds at most a quarter turn.
-        """
+        """Returns the wrist and its angle, which starts within a turn."""
         # Two calls: in a motion, XLA computes what is the same in all steps once.
         _, first = self._unwound(jnp.zeros_like(t), base)
         wrist, bearing = self._unwound(t, base)
         return wrist, bearing - 2 * np.pi * whole_turns(first)
 
     def _unwound(self, t: Array, base: Array) -> tuple[Array, Array]:
-        """The wrist and its angle, to any number of turns."""
+        """Returns the wrist and its angle, to any number of turns."""
         hub, (angle, ray) = plane_vector(*self.center) - base, _ray(self, t)
+        # The angle of the larger vector, to the centre or from there, is continuous.
+        # The smaller one adds at most a quarter turn.
         around = self.radius**2 > dot(hub, hub)
         larger = jnp.where(around, ray, hub)
         angle = jnp.where(around, angle, plane_angle(hub.imag, hub.real))
@@ -386,7 +367,7 @@ class CircleTask(TipReference):
 
 # A function, because each access to a method of an equinox module creates an object.
 def _ray(circle: CircleTask, t: Array) -> tuple[Array, Array]:
-    """Angle and vector from the centre to the tip."""
+    """Returns the angle and the vector from the centre to the tip."""
     angle = circle.phase + 2 * np.pi * t / circle.period
     sin, cos = sincos(angle)
     return angle, plane_vector(circle.radius * cos, circle.radius * sin)
@@ -402,14 +383,12 @@ def _circle_tip(circle: CircleTask, t: Array) -> Array:
 def _circle_survey(
     circle: CircleTask, linkage: Linkage, ts: Array
 ) -> tuple[Array, Array]:
-    """Returns times of one turn, or the run if shorter, and whether each is in reach.
-
-    The reach ends first where the wrist is nearest to or farthest from the base, or
-    along a direction that the ground or the last link fixes.
-    """
+    """Returns times of one turn, at most of the run, and whether each is in reach."""
     begin, turn = ts[0], abs(circle.period)
     arm = arm_of(linkage, circle.orientation)
     hub = plane_vector(*circle.center) - arm.base
+    # The reach ends first where the wrist is nearest to or farthest from the base, or
+    # along a direction that the ground or the last link fixes.
     fixed = arm.angle[0], circle.orientation - arm.locked[2]
     directions = jnp.stack([jnp.angle(hub), *fixed])
     lead = jnp.append(directions, directions + np.pi) - circle.phase

@@ -32,18 +32,17 @@ PROFILES: dict[str, Callable[[Array], Array]] = {
 
 
 class Travel(Part):
-    """The timing of a travel from the start of a path to its end in a given time.
+    """The timing of a travel along a path in a given time.
 
     **Arguments:**
 
     - `duration`: positive [s].
-    - `begin`: time at which the travel starts [s]; the reference rests before.
+    - `begin`: when the travel starts [s]; the reference rests before.
     - `profile`: "harmonic" (the way is a cosine), "cycloidal" (the acceleration is a
       sine), "quintic" (no acceleration at both ends; the default) or "trapezoidal" (the
-      velocity is a trapezium, speeding up and slowing down in a quarter of the time
-      each).
-    - `shock`: share of the way done at constant velocity. The velocity then jumps at
-      both ends.
+      velocity rises and falls in a quarter of the time each).
+    - `shock`: share of the way done at constant velocity, which then jumps at both
+      ends.
 
     **Raises:** ValueError for malformed arguments.
 
@@ -101,11 +100,9 @@ class Laps(Part):
 
 
 def times_of_moves(timing: Callable[[Array], Array], times: Array) -> Array:
-    """Adds as many times, at which the share of the way changes between the given ones.
-
-    A short move in a long run may lie between two times. Each pass finds it a thousand
-    times as closely.
-    """
+    """Adds as many times, at which the share of the way changes between those given."""
+    # A short move in a long run may lie between two times. Each pass finds it a
+    # thousand times as closely.
     found = times
     for _ in range(_PASSES):
         moves = jnp.abs(jnp.diff(jax.vmap(timing)(found)))
