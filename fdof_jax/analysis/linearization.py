@@ -169,8 +169,8 @@ def linearize(
     is by default the scene's start.
 
     **Returns:** `A` and `B` of d(q, qd)/dt = A (q, qd) + B tau, for small changes. The
-    efforts tau act in addition to the forces [N or N m]. At a kink, a force has its
-    slope at the state: a controller at its limit has no gains.
+    efforts tau act in addition to the forces [N or N m]. Of a force with kinks, the
+    slope at the state counts: a controller at its limit has no gains.
 
     **Raises:** ValueError for malformed arguments.
 

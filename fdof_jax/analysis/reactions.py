@@ -125,7 +125,7 @@ def regressor(
 
     The efforts are tau = regressor : `inertial_parameters(linkage)`, summed over links
     and parameters. The rank of regressors stacked over a motion is the number of
-    their combinations that can be identified: nine of twelve for an RPR arm.
+    parameter combinations that can be identified: nine of twelve for an RPR arm.
 
     **Arguments:** `linkage`, whose masses and inertias do not matter; `q`, `qd`, `qdd`:
     joint positions, velocities and accelerations (n,) [m or rad, and per s and s^2].

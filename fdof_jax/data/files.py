@@ -101,11 +101,11 @@ def load(path: str | os.PathLike, classes: Classes = ()) -> Any:
     names.
 
     **Returns:** the tree, on the default device, with numbers equal to the last bit.
-    Arrays have JAX's default dtypes. Unless the constructor converts them, arrays
-    without axes become Python numbers, and lists tuples.
+    Arrays have JAX's default dtypes. Arrays without axes become Python numbers, and
+    lists tuples, unless the constructor converts them.
 
     **Raises:** FileNotFoundError if there is no file. ValueError, with the place in the
-    file, if it is no complete JSON, comes from a newer version, or names unknown
+    file, if it is not complete JSON, comes from a newer version, or names unknown
     classes or arguments, and if a constructor raises it.
     """
     path = file_path("path", path)

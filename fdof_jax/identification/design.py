@@ -135,8 +135,8 @@ def next_motion(
 
     **Arguments:**
 
-    - `experiment`: takes the motion's numbers by name, returns the `scene_at` of `fit`;
-      for instance a class of Equinox modules.
+    - `experiment`: takes the motion's numbers by name and returns the `scene_at` of
+      `fit`; for instance a class of Equinox modules.
     - `found`: the `FitResult` of the earlier recordings. Parameters determined only in
       combination count as unknown.
     - `start`: first guess of the motion's numbers, strictly within all limits.

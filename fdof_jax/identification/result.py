@@ -41,10 +41,10 @@ class FitResult(Report):
       whose standard error exceeds their size (the greater of value and scale).
     - `rms`: root mean square of the residuals [as observed].
     - `noise`: root of the weighted sum of squares over the degrees of freedom: relative
-      to the given noise [1], or an estimate of the noise [as observed].
-    - `converged`: whether a further step would change the parameters that the motion
-      determines by less than 3 % of their standard errors, or a millionth of their
-      sizes.
+      to the given noise [1], or an estimate of it if none is given [as observed].
+    - `converged`: whether a further step would change the parameters by less than 3 %
+      of their standard errors, or a millionth of their sizes. Parameters that the
+      motion does not determine do not count.
     - `message`: why the search stopped, and warnings.
     - `history`: weighted sum of squares over the whole recording, at the start of the
       last search and at each accepted point.
@@ -52,7 +52,7 @@ class FitResult(Report):
       is given, or else estimated from changes between successive residuals.
     - `faults`: reasons not to use the parameters, in words: no convergence, `weak`
       combinations, no scene with these parameters, residuals above 1.5 times the noise
-      of `held_out`, and held-out residuals above 1.1 times this noise by more than
+      (see `held_out`), and held-out residuals above 1.1 times this noise by more than
       three standard deviations.
     """
 

@@ -12,7 +12,7 @@ from .. import Linkage
 from ..checks import plain, refusal
 from .source import Model
 
-Data = Any  # an `mujoco.MjData`
+Data = Any  # a `mujoco.MjData`
 _SLIDE, _HINGE, _OF_JOINTS = 2, 3, 2  # of MuJoCo's mjtJoint and mjtEq
 FAR = 1e9  # stands for infinity where MuJoCo wants a number
 _EXACT = 1e-9  # what is as far out of the plane is taken for rounding

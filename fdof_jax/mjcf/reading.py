@@ -63,13 +63,14 @@ def from_mjcf(
 
     The first hinge's axis points at the viewer and gravity downwards, so x may be -X of
     the model's world. `q` equals `qpos`, or -`qpos` at hinges that turn the other way.
-    The arm is the chain with most actuators, or else most joints. The account says what
-    became of each part. MuJoCo compiles the model: `pip install "fdof_jax[test]"`.
+    The arm is the chain of `tip`, or else that with most actuators, or else most
+    joints. The account says what became of each part. MuJoCo compiles the model:
+    `pip install "fdof_jax[test]"`.
 
     **Arguments:**
 
-    - `source`: an XML text, which may name no other files, or the path of a file, an
-      `mujoco.MjModel` or an `mujoco.MjSpec`.
+    - `source`: an XML text, which may name no other files, or the path of a file, a
+      `mujoco.MjModel` or a `mujoco.MjSpec`.
     - `controls`: of the actuators, in MuJoCo's order and units; by default those of the
       first key frame, or 0.
     - `tip`: name of the site or body that is the tip; by default one named tip, ee,

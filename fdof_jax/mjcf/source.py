@@ -12,9 +12,9 @@ from xml.parsers import expat
 
 from ..checks import plain, refusal
 
-Model = Any  # an `mujoco.MjModel`, of which type checkers know nothing
+Model = Any  # a `mujoco.MjModel`, of which type checkers know nothing
 Node = ElementTree.Element
-_EXPECTED = "an XML text, the path of a file, an mujoco.MjModel or an mujoco.MjSpec"
+_EXPECTED = "an XML text, the path of a file, a mujoco.MjModel or a mujoco.MjSpec"
 # MuJoCo reads bare ampersands, and dashes in comments; XML has neither.
 _LOOSE = re.compile(r"<!--.*?(?:-->|\Z)|&(?!#?\w+;)", re.DOTALL)
 # What is kept of a URDF. MuJoCo does not read others, or makes pictures of them.

@@ -26,7 +26,7 @@ class Response(Report):
 
     Overshoot, rise and settling refer to the last position, which a load or friction
     may keep away from the reference. They are NaN for joints whose reference moves
-    meanwhile (then `step` is too), or has been reached from the start.
+    meanwhile (then `step` is too), or was reached from the start.
 
     - `joints`: names of the moving joints.
     - `step`: from the first position to the final reference (joint,) [m or rad].
@@ -90,8 +90,8 @@ def response(
 
     - `solution`: one motion, with ten samples or more in the fastest swing.
     - `forces`: those of the solution; for `simulate_sampled`, `(control, *forces)`. One
-      is a `PDController`, `PIDController`, `GravityFeedforward` or `ComputedTorque`, or
-      a drive that holds one.
+      of them is a `PDController`, `PIDController`, `GravityFeedforward` or
+      `ComputedTorque`, or a drive that holds one.
     - `since`: time from which the motion counts, such as that of a step [s]; by default
       all of it counts.
 
@@ -187,8 +187,8 @@ def step_measures(
 ) -> tuple[float, float, float]:
     """Measures any response to a step, such as the tip's, from its samples.
 
-    **Arguments:** `ts`: times since the step (time,) [s]; `change`, `rate`: what
-    responds, less its first value, and its derivative (time,); `final`: the intended
+    **Arguments:** `ts`: times since the step (time,) [s]; `change`: the response less
+    its first value (time,); `rate`: its derivative (time,); `final`: the intended
     change.
 
     **Returns:** overshoot, as a share of the final change; rise time [s], NaN if 90 %

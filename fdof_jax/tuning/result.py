@@ -51,9 +51,9 @@ class TuneResult(Report):
     - `loss`: its loss [m^2 with the default loss].
     - `histories`: a `History` per run; the first run starts from the scene's own gains.
     - `lower`, `upper`: the bounds of kp and kd (2, n).
-    - `converged`: whether the run stopped by itself, no actuator was at its limit for
-      more than 90 % of the time, and a change of the gains by 1 %, within the bounds,
-      would change the loss by less than 0.01 %, to first order.
+    - `converged`: whether all of this holds: the run stopped by itself; no actuator was
+      at its limit for more than 90 % of the time; a change of the gains by 1 %, within
+      the bounds, would change the loss by less than 0.01 %, to first order.
     - `message`: why the run stopped, and warnings.
     - `member_loss`, `member_tip_error`: loss and rms tip error [m] of each member of
       the ensemble (member,).

@@ -90,12 +90,12 @@ def tune(
 
     - `scene`: with exactly one `PDController`, `GravityFeedforward` or
       `ComputedTorque`.
-    - `factor`: the gains stay within this factor of their start, above 1; by default 4.
+    - `factor`: the gains stay within this factor of their start; above 1, by default 4.
     - `bounds`: instead of a factor, least and greatest gains: two arrays (2, n) with
       the rows kp and kd [N/m or N m/rad, N s/m or N m s/rad].
     - `loss`: `(scene, solution) -> residuals`, whose sum of squares is minimised. By
       default the mean squared tip error at 1001 equally spaced times in [0, t1]. A
-      scalar, never negative, is minimised itself; choose "l-bfgs" for it.
+      scalar, which must not be negative, is minimised itself; choose "l-bfgs" for it.
     - `ensemble`: scenes like `scene`, from `stacked`. All get the same gains, which
       start from those of `scene`.
     - `over`: "mean" or "worst" loss of the ensemble; the worst is a power mean of order

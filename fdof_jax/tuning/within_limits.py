@@ -303,8 +303,8 @@ class TunedWithin(Report):
     - `start`, `lower`, `upper`: kp and kd at the start, and their bounds (2, n).
     - `message`: why the search stopped.
     - `limit`, `joint`, `allowed`, `reached`: for each limit, its name, the joint's
-      name, and the allowed and the reached value [1, s, N or N m]; NaN if the joint
-      does not settle or its loop is unstable.
+      name, and the allowed and the reached value [1, s, N or N m]. The latter is NaN if
+      the joint does not settle or its loop is unstable.
     """
 
     scene: Scene
@@ -370,9 +370,10 @@ def tune_within(
     - `loss`, `factor`, `bounds`, `report`: as in `tune`.
     - `max_steps`: greatest number of steps, of one or a few evaluations each.
 
-    **Returns:** a `TunedWithin`. If no gains found meet all limits, it holds those
-    whose greatest excess is least, as a share of the step, or of the limit for efforts
-    and margins. Other gains may then meet more limits.
+    **Returns:** a `TunedWithin`. If the search finds no gains that meet all limits, the
+    result has those whose greatest excess is least. Excesses are shares of the step;
+    those of efforts and margins are shares of their limits. Other gains may meet more
+    limits.
 
     **Raises:** ValueError as `tune`, and if the arm has no equilibrium at the last set
     point.
