@@ -1,8 +1,4 @@
-"""Minimisation within bounds by derivatives, many runs at once.
-
-All running functions are evaluated together, in one compiled program for runs of one
-scene each or of several. NumPy does the little work after an evaluation, on the host.
-"""
+"""Minimisation within bounds by derivatives, many runs at once."""
 
 import time
 from collections.abc import Callable
@@ -46,8 +42,8 @@ _LANES = 8
 class Evaluation(NamedTuple):
     """A function and its derivatives at one point per run.
 
-    Loss (run,), gradient (run, n), semidefinite curvature (run, n, n), for instance
-    Gauss-Newton's; `facts`: arrays (run, ...) kept with the point.
+    Loss (run,), gradient (run, n), semidefinite curvature (run, n, n); `facts` (run,
+    ...) are kept with the point.
     """
 
     loss: Any
@@ -63,7 +59,7 @@ Evaluate = Callable[[Array, Any], Evaluation]  # (z, problem) of one lane
 
 
 class LevenbergMarquardt:
-    """The Levenberg-Marquardt method: steps to its model's minimum in the box."""
+    """Steps to the minimum in the box of the damped quadratic model."""
 
     def __init__(self, z: np.ndarray):
         self.damping, self.growth = 1e-3, 4
@@ -78,7 +74,7 @@ class LevenbergMarquardt:
         self.damping, self.growth = max(self.damping / 4, 1e-9), 4
 
     def refused(self) -> bool:
-        """Shortens the next step, and returns whether one is left to try."""
+        """Shortens the next step; returns whether one is left to try."""
         self.damping *= self.growth
         self.growth *= 2
         return self.damping <= 1e8
@@ -126,11 +122,11 @@ def box_minimum(
 ) -> np.ndarray:
     """Minimises slope @ x + x @ matrix @ x / 2 in a box, for a definite matrix.
 
-    It guesses which bounds are active until a guess proves right: block principal
-    pivoting (Judice and Pires, 1994). That mostly takes a few factorisations, where
-    SciPy's BVLS takes one per bound. Of hundreds of unknowns that nearly depend on each
-    other the result may be no minimum: a trial step, which the search then rejects.
+    It guesses the active bounds until a guess proves right: block principal pivoting
+    (Judice and Pires, 1994). With hundreds of nearly dependent unknowns it may fail;
+    the search then rejects the step.
     """
+    # It mostly takes a few factorisations, where SciPy's BVLS takes one per bound.
     x, below, above = np.zeros_like(slope), *np.zeros((2, slope.size), bool)
     least, patience = np.inf, _PATIENCE
     for _ in range(100 + 10 * slope.size):
@@ -210,7 +206,6 @@ class Run:
         return self.best.gradient_norm <= max(least, of_loss * self.best.loss)
 
     def next(self) -> np.ndarray:
-        """Returns the point to evaluate next."""
         low = np.maximum(self.low, self.z - _LONGEST_STEP)
         high = np.minimum(self.high, self.z + _LONGEST_STEP)
         step = self.method.step(self.z, self.at, low, high)
@@ -233,12 +228,12 @@ class Run:
 
 
 def best_of(runs: list[Run]) -> Run:
-    """Returns the run of least loss, a failed one only if all have failed."""
+    """Returns the run of least loss; a failed one only if all have failed."""
     return min(runs, key=lambda run: (run.failed, run.best.loss))
 
 
 def check_search(max_steps: int, report: Callable | None) -> int:
-    """Returns `max_steps`; raises ValueError for malformed arguments of a search."""
+    """Returns `max_steps`; raises ValueError for malformed arguments."""
     if report is not None:
         function("report", report, "a callable or None")
     return whole_number("max_steps", max_steps, 1)
@@ -258,12 +253,9 @@ def minimise(
 ) -> list[Run]:
     """Minimises a function per run, from (run, n) starts within (run, n) bounds.
 
-    **Arguments:** `evaluate`: `(z, runs) -> Evaluation`, for points `z` of the runs
-    with indices `runs`; `method`: one of `METHODS`; `max_steps`: evaluations after the
-    first; `enough`: a run stops when its loss falls by less than this part; `report`:
-    called after each step with a line in which `describe` says where the runs are.
-
-    **Raises:** ValueError as `check_search`.
+    `evaluate` is called with points and the indices of their runs. A run stops when its
+    loss falls by less than the part `enough`. `describe` says in a `report` where the
+    runs are.
     """
     max_steps = check_search(max_steps, report)
     began = time.perf_counter()
@@ -287,7 +279,7 @@ def minimise(
 
 
 def check_scene(name: str, scene: Scene) -> None:
-    """Raises ValueError for shapes and kinds with which nothing can be simulated."""
+    """Raises ValueError for shapes and kinds that cannot be simulated."""
     instance(name, scene, Scene)
     check_linkage(scene.linkage)
     real_state(f"{name}.state0", scene.state0, scene.linkage)
@@ -296,10 +288,7 @@ def check_scene(name: str, scene: Scene) -> None:
 
 
 def check_motion(name: str, scene: Scene, ts: ArrayLike) -> None:
-    """Raises ValueError with the reason if a scene cannot be simulated over `ts`.
-
-    Searches call it after a failure, as a check beforehand would have to compile.
-    """
+    """Raises ValueError with the reason if a scene cannot be simulated over `ts`."""
     try:
         simulate(scene, ts)
     except RuntimeError as error:
@@ -318,7 +307,7 @@ def sum_of_squares(found: Sensitivities, **facts: Array) -> Evaluation:
 def _evaluate(
     evaluate: Evaluate, z: Array | np.ndarray, moving: PyTree, shared: PyTree
 ) -> Evaluation:
-    """Evaluates lanes, along the leading axis of `z` and `moving`."""
+    """Evaluates lanes along the leading axis of `z` and `moving`."""
 
     def lane(z, moving):
         return evaluate(z, eqx.combine(moving, shared))
@@ -331,7 +320,7 @@ def _evaluate(
 
 
 def _moves(leaf: object) -> bool:
-    """Returns whether an array with leading axes (run, member) differs along them."""
+    """Returns whether an array differs along its axes (run, member)."""
     return isinstance(leaf, np.ndarray) and bool((leaf != leaf[:1, :1]).any())
 
 
@@ -345,9 +334,7 @@ class Lanes:
         starts: int = 1,
         order: int = 1,
     ):
-        """`problems`: rows of equally many members, for as many runs as `starts` each;
-        `order`: order of the power mean over the members.
-        """
+        """`problems`: equally many members per row; `order`: of the power mean."""
         self.evaluate, self.order = evaluate, order
         every = stacked([stacked(members) for members in problems])
         # Values common to all lanes are not batched, so XLA computes with them once.
@@ -382,10 +369,7 @@ class Lanes:
 
 
 def power_mean(members: Evaluation, order: int) -> Evaluation:
-    """The power mean over the axis of members, mean(loss^order)^(1/order).
-
-    Its curvature combines the members' curvatures with the exact one of the mean.
-    """
+    """The power mean over the axis of members, mean(loss^order)^(1/order)."""
     loss, gradient, curvature, facts = members
     largest = np.max(loss, axis=1, keepdims=True)
     part = loss / np.where(largest > 0, largest, 1)

@@ -1,4 +1,4 @@
-"""Analysis of configurations and motions: equilibria, linearisation, reactions."""
+"""Analysis of configurations and motions."""
 
 from ..dynamics import inertia_ratios
 from .linearization import (

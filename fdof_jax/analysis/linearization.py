@@ -1,4 +1,4 @@
-"""Arms at rest, and linear analysis about them: matrices, loops, modes of motions."""
+"""Arms at rest, and linear analysis about them: matrices, loops and modes."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -43,8 +43,7 @@ _STABLE = 2.6
 class Linearization(NamedTuple):
     """Matrices of d(q, qd)/dt = A (q, qd) + B tau about a state, (2n, 2n) and (2n, n).
 
-    They hold for small changes of positions [m or rad], velocities and efforts
-    [N or N m].
+    They hold for small changes of positions [m or rad] and efforts [N or N m].
     """
 
     A: Float[Array, "state state"]
@@ -68,18 +67,16 @@ def equilibrium(
 ) -> Float[Array, " joint"]:
     """Computes positions near `q` at which the arm stays at rest under its forces.
 
-    An equilibrium is an operating point for `linearize`. Under a PD controller it is
-    the position held while the reference stands still, including the sag.
+    Under a PD controller this is the position held, including the sag.
 
-    **Arguments:** `linkage`; `q`: first guess [m or rad]; `forces`: elements without a
-    state of their own; `t`: time at which they are evaluated [s].
+    **Arguments:** `q`: first guess [m or rad]; `forces`: elements without states; `t`:
+    time at which they act [s].
 
-    **Returns:** joint positions (n,); NaN if the Levenberg-Marquardt method finds none,
-    for instance from a guess at which actuators are at their limits. The equilibrium
-    need not be stable: see `linearize`.
+    **Returns:** joint positions (n,), stable or not; NaN if the search finds none, for
+    instance from a guess at which actuators are at their limits.
 
-    **Raises:** ValueError for malformed arguments, and for elements that hold joints: a
-    joint held by friction rests at many positions.
+    **Raises:** ValueError for malformed arguments, and for elements that hold joints:
+    with friction an arm rests at many positions.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
@@ -140,11 +137,9 @@ def holding_efforts(
 ) -> Float[Array, " joint"]:
     """Computes the joint efforts that hold the arm at rest, together with the forces.
 
-    Without forces the efforts balance gravity. Springs and stops carry their part, and
-    masses of elements are held too.
+    Without forces the efforts balance gravity. Masses of elements are held too.
 
-    **Arguments:** `linkage`; `q`: joint positions [m or rad]; `forces`: elements
-    without a state of their own; `t`: time at which they are evaluated [s].
+    **Arguments:** `q`: joint positions [m or rad]; `forces`, `t`: as in `equilibrium`.
 
     **Returns:** efforts (n,), 0 at fixed pairs [N or N m].
 
@@ -167,16 +162,15 @@ def holding_efforts(
 def linearize(
     linkage: Linkage, state: State, forces: Forces = (), t: ArrayLike = 0.0
 ) -> Linearization:
-    """Linearises the equations of motion about a state, at a time.
+    """Linearises the equations of motion about a state.
 
-    **Arguments:** `linkage`; `state`: joint positions and velocities; `forces`:
-    elements without a state of their own; `t`: time at which they are evaluated [s]. A
-    `Scene` may stand for linkage and forces: `linearize(scene, state, t)`. By default
-    the state is then the scene's start.
+    **Arguments:** `state`: joint positions and velocities; `forces`: elements without
+    states; `t`: time at which they act [s]. In `linearize(scene, state, t)`, the state
+    is by default the scene's start.
 
     **Returns:** `A` and `B` of d(q, qd)/dt = A (q, qd) + B tau, for small changes. The
-    efforts tau act in the joints in addition to the forces [N or N m]. For a force with
-    kinks, the slope at the state counts: a controller at its limit has no gains.
+    efforts tau act in addition to the forces [N or N m]. Of a force with kinks, the
+    slope at the state counts: a controller at its limit has no gains.
 
     **Raises:** ValueError for malformed arguments.
 
@@ -233,7 +227,7 @@ def _each_linearized(
 def _with_references(
     element: Element, changed: Callable[[Callable], Callable]
 ) -> Element:
-    """Returns an element with its references changed, also those of commands."""
+    """Returns an element with all its references changed."""
 
     def of(part: object) -> object:
         if isinstance(part, PDController):  # whose reference may be a plain function
@@ -255,10 +249,10 @@ def loop_matrices(
 
     **Arguments:** as in `open_loop`, which makes a system of them.
 
-    **Returns:** A, B, C and F (3, state, n). The state y is (q, qd, the controller's
-    own): dy/dt = A y + B tau with efforts tau added to the controller's, which are -C y
-    [N or N m]. Constant efforts hold the arm at rest. Changes of the reference's
-    positions, velocities and accelerations at the time add F times these to dy/dt.
+    **Returns:** A, B, C and F (3, state, n) of dy/dt = A y + B tau. The state y is (q,
+    qd, the controller's own). The efforts tau [N or N m] add to the controller's, which
+    are -C y, and to constant ones that hold the arm at rest. Changes of the reference's
+    positions, velocities and accelerations add F times these to dy/dt.
 
     **Raises:** ValueError for malformed arguments.
     """
@@ -314,8 +308,7 @@ def _loop_matrices(
 class Modes(NamedTuple):
     """Eigenvalues of the matrix A along a motion, the fastest last.
 
-    - `eigenvalues`: (time, mode) [1/s], two for each joint that moves; NaN where the
-      motion is NaN.
+    - `eigenvalues`: (time, mode) [1/s], two per moving joint; NaN where the motion is.
     """
 
     eigenvalues: Complex[np.ndarray, "time mode"]
@@ -333,9 +326,9 @@ class Modes(NamedTuple):
 
     @property
     def longest_step(self) -> Float[np.ndarray, " time"]:
-        """Longest step sizes at which a Runge-Kutta method of order 4 is stable [s].
+        """Longest stable step sizes of Runge-Kutta methods of order 4 [s].
 
-        The rule holds for any damping: 2.6 over the fastest frequency.
+        They are 2.6 over the fastest frequency, for any damping.
         """
         with np.errstate(divide="ignore"):
             return _STABLE / self.frequency.max(axis=1)
@@ -345,17 +338,12 @@ def closed_loop_modes(linkage: Linkage, forces: Forces, solution: Solution) -> M
     """Computes the eigenvalues of the linearised equations at each time of a motion.
 
     Each state is analysed as if the arm stayed in it. Along a path that changes as fast
-    as the modes, stable eigenvalues do not prove stability. While a controller is at
-    its limit, the gains of that joint do not act.
+    as the modes, stable eigenvalues do not prove stability. A controller at its limit
+    has no gains. The function cannot be used within JAX's transformations.
 
-    NumPy computes the eigenvalues on the CPU, because XLA supports general matrices
-    only there. The function cannot be used within JAX's transformations.
+    **Arguments:** `forces`: elements without states; `solution`: a motion under them.
 
-    **Arguments:** `linkage`; `forces`: elements without a state of their own;
-    `solution`: a motion under these forces.
-
-    **Returns:** `Modes`, with natural frequencies [rad/s], damping ratios and the
-    longest step size of an explicit method [s].
+    **Returns:** `Modes`, with frequencies [rad/s], damping ratios and stable steps [s].
 
     **Raises:** ValueError for malformed arguments.
 

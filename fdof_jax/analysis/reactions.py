@@ -44,19 +44,17 @@ def joint_reactions(
 ) -> Float[Array, "time joint 3"]:
     """Computes force and moment of each joint's bearing on the next link over time.
 
-    They follow from the balances of Newton and Euler, link by link from the tip. In a
-    joint's free direction, the reaction is the effort of dampers, controllers, drives,
-    armatures and whatever holds the joint. Loads on points act on the links themselves.
+    In a joint's free direction, the reaction is the effort of dampers, controllers,
+    drives, armatures and whatever holds the joint. Loads on points act on the links.
 
-    **Arguments:** `linkage`, `forces` and `solution` of one `simulate`. For
-    `simulate_sampled`, the forces are `(control, *forces)`. A `Scene` may stand for
-    linkage and forces: `joint_reactions(scene, solution)`.
+    **Arguments:** `linkage` and `forces` of the solution, or a `Scene` in their place.
+    The forces of `simulate_sampled` are `(control, *forces)`.
 
     **Returns:** force (x, y) [N] and moment [N m] on the moving link, at its
     characteristic point (see `joint_positions`). The previous link gets the opposite.
 
-    **Raises:** ValueError if `forces` is not a tuple of force elements, or an element
-    moves masses but has no method `loads`.
+    **Raises:** ValueError for malformed arguments, and for an element that moves masses
+    but has no method `loads`.
 
     >>> import fdof_jax as fj
     >>> import numpy as np
@@ -100,8 +98,8 @@ def _reactions(
 def inertial_parameters(linkage: Linkage) -> Float[Array, "link 4"]:
     """Computes mass [kg], moments m p, m q [kg m] and inertia [kg m^2] of each link.
 
-    The inertia is about the characteristic point of the link. The dynamics are linear
-    in these parameters: see `regressor`.
+    The inertia is about the link's characteristic point. The dynamics are linear in
+    these parameters: see `regressor`.
 
     **Raises:** ValueError if `linkage` is not a linkage.
 
@@ -126,14 +124,11 @@ def regressor(
     """Computes the coefficients of the inertial parameters in the inverse dynamics.
 
     The efforts are tau = regressor : `inertial_parameters(linkage)`, summed over links
-    and parameters. The regressor itself does not depend on the linkage's masses and
-    inertias.
+    and parameters. The rank of regressors stacked over a motion is the number of
+    parameter combinations that can be identified: nine of twelve for an RPR arm.
 
-    The rank of regressors stacked over a motion is the number of combinations of
-    parameters that can be identified: nine of the twelve for an RPR arm.
-
-    **Arguments:** `linkage`; `q`, `qd`, `qdd`: joint positions, velocities and
-    accelerations (n,) [m or rad, and per s and s^2].
+    **Arguments:** `linkage`, whose masses and inertias do not matter; `q`, `qd`, `qdd`:
+    joint positions, velocities and accelerations (n,) [m or rad, and per s and s^2].
 
     **Raises:** ValueError for malformed arguments.
 

@@ -1,4 +1,4 @@
-"""Tables of motions and results, files of pytrees, and export to other engines."""
+"""Tables of motions, files, and models of other engines."""
 
 from ..base.report import Report
 from ..mjcf.reading import MjcfModel, from_mjcf

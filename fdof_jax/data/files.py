@@ -1,4 +1,4 @@
-"""Files of JSON that hold scenes, elements and results as a person would write them."""
+"""Files of JSON that hold scenes, elements and results."""
 
 import dataclasses
 import importlib
@@ -44,35 +44,28 @@ _MEANT = ValueError, TypeError, LookupError, AttributeError, ArithmeticError
 def save(path: str | os.PathLike, tree: PyTree) -> None:
     """Writes scenes, elements, results or numbers to a file of JSON, for `load`.
 
-    The file holds each object's public name and the arguments of its constructor. It
-    can be read, compared, sent, and written by hand:
-
-        {"fdof_jax": "0.2",
-         "State": {"q": [0.5, 0.0], "qd": [0.0, 0.0]}}
+    The file names each object by its public name, with the arguments of its
+    constructor. You can read and write it by hand:
 
     - An argument with a default may be absent.
-    - A list that begins with a number is an array; `"inf"`, `"-inf"` and `"nan"` are
-      numbers. Any other list is a tuple.
-    - `{"tuple": [...]}` is a tuple that begins with a number or an array, and
-      `{"dict": {...}}` a dictionary.
+    - A list that begins with a number is an array, any other a tuple. `"inf"`, `"-inf"`
+      and `"nan"` are numbers.
+    - A tuple that begins with a number or an array is `{"tuple": [...]}`.
+    - A dictionary is `{"dict": {...}}`.
     - At the top level, `"value"` names anything that is no object.
 
-    An existing file is replaced when the new one is complete. It keeps its permissions,
-    and a link to it stays.
+    An existing file is replaced when the new one is complete.
 
     **Arguments:**
 
-    - `path`: path of the file, such as "scene.json"; no suffix is added.
-    - `tree`: a `Scene`, a `Linkage`, force elements, references, a `TuneResult`, a
-      `FitResult`, or tuples and dicts of these and of numbers, texts and arrays.
-      Instances of your own `Element`, `equinox.Module`, dataclass or NamedTuple are
-      saved if their constructor's arguments are fields, or a method `arguments` returns
-      them.
+    - `path`: such as "scene.json"; no suffix is added.
+    - `tree`: scenes, elements, references, results, numbers, texts, arrays, and tuples
+      and dicts of these. Objects of your own classes need fields, or a method
+      `arguments`, for their constructor's arguments.
 
-    **Raises:** ValueError for what cannot be saved, with its place in the tree: a
+    **Raises:** ValueError, with the place in the tree, for what cannot be saved: a
     function, a traced value, a `Solution` (use `to_xarray`), a network or a batch (use
-    `equinox.tree_serialise_leaves`), an object of another kind. No file is then
-    written, and an existing one is unchanged.
+    `equinox.tree_serialise_leaves`).
 
     >>> import fdof_jax as fj
     >>> import os, tempfile
@@ -102,22 +95,18 @@ def save(path: str | os.PathLike, tree: PyTree) -> None:
 def load(path: str | os.PathLike, classes: Classes = ()) -> Any:
     """Loads what `save` or a person wrote to a file.
 
-    Constructors make the objects and check their arguments. Nothing else is executed,
-    and the memory used is a small multiple of the file's size.
+    Constructors make the objects and check their arguments. Nothing else is executed.
 
-    **Arguments:**
+    **Arguments:** `path`: of the file; `classes`: a tuple of your own classes that it
+    names.
 
-    - `path`: path of the file.
-    - `classes`: a tuple of your own classes that the file names.
+    **Returns:** the tree, on the default device, with numbers equal to the last bit.
+    Arrays have JAX's default dtypes. Arrays without axes become Python numbers, and
+    lists tuples, unless the constructor converts them.
 
-    **Returns:** the tree, on the default device. Numbers are equal to the last bit.
-    Arrays have JAX's default dtypes: float64 with double precision, float32 without,
-    integers and booleans. An array without axes becomes a Python number, and a list a
-    tuple, unless the constructor converts it.
-
-    **Raises:** FileNotFoundError if there is no file. ValueError, with the file and the
-    place in it, if the file is no JSON, is cut short, comes from a newer version, or
-    names unknown classes or arguments, and if a constructor raises it.
+    **Raises:** FileNotFoundError if there is no file. ValueError, with the place in the
+    file, if it is not complete JSON, comes from a newer version, or names unknown
+    classes or arguments, and if a constructor raises it.
     """
     path = file_path("path", path)
     several = isinstance(classes, tuple | list)
@@ -241,7 +230,7 @@ def _depth(node: Json) -> int:
 
 
 def _text(node: Json, indent: str = "", before: str = "") -> str:
-    """Returns JSON in which all that fits into a line stands on one."""
+    """Returns JSON that breaks only lines that are too long."""
     line = before + json.dumps(node)
     if len(indent + line) < 88 or not isinstance(node, dict | list):
         return line
@@ -340,7 +329,7 @@ def _array(place: str, node: list[Json]) -> jax.Array:
 
 
 def _floats(node: Json) -> Json:
-    """Returns nested lists of numbers with floats in the place of their names."""
+    """Returns nested lists of numbers, with floats in place of their names."""
     if isinstance(node, list):
         return [_floats(item) for item in node]
     if not _is_number(node):  # NumPy would reserve the longest text for each number

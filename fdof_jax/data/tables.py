@@ -33,22 +33,19 @@ def _checked(linkage: Linkage, solution: Solution) -> tuple[np.ndarray, list[str
 def to_xarray(linkage: Linkage, solution: Solution) -> "xarray.Dataset":
     """Converts a solution to an xarray Dataset, with names and units.
 
-    The Dataset holds joint positions `q` and velocities `qd` over `time` and `joint`,
-    and the solution's `outcome`, `num_steps` and `time_reached` for each trajectory;
-    for `simulate_sampled`, `outcome` alone. Where elements hold joints, it also holds
-    the `modes` of each joint, as numbers, and the energy `taken` (see `Solution`). The
-    joints are named R1, P2 and so on, with the coordinate `unit`; a joint of both kinds
-    within a batch is named by its number. Batch axes come first, as `batch` (or
-    `batch_1`, `batch_2` and so on). To name an axis and give it values, use
-    `.rename(batch="payload").assign_coords(payload=masses)`. The Dataset leaves out
-    states of elements and events: to go on from a motion, save its last state and
-    `own`.
+    The Dataset holds `q` and `qd` over `time` and `joint`, and `outcome`, `num_steps`
+    and `time_reached` for each trajectory (of `simulate_sampled`, `outcome` alone).
+    Where elements hold joints, it also holds `modes`, as numbers, and the energy
+    `taken` (see `Solution`). Joints are named R1, P2 and so on, with the coordinate
+    `unit`; a joint of both kinds within a batch is named by its number. Batch axes come
+    first, as `batch`, or `batch_1`, `batch_2` and so on;
+    `.rename(batch="payload").assign_coords(payload=masses)` names one and gives it
+    values. States of elements and events are left out.
 
-    **Arguments:** `linkage`: that of the solution, one or a batch; `solution`: a result
-    of `simulate`, `simulate_sampled` or `sweep`, one motion or a batch at the same
-    times [s].
+    **Arguments:** `linkage`: one or a batch; `solution`: one motion or a batch at the
+    same times [s].
 
-    **Returns:** the Dataset; the attributes `units` of its variables are SI.
+    **Returns:** the Dataset; its variables have an attribute `units`.
 
     **Raises:** ImportError without xarray, which `fdof_jax[data]` installs; ValueError
     for malformed arguments.
@@ -85,16 +82,13 @@ def to_xarray(linkage: Linkage, solution: Solution) -> "xarray.Dataset":
 def to_pandas(linkage: Linkage, solution: Solution) -> "pandas.DataFrame":
     """Converts a solution to a pandas DataFrame with a row per time.
 
-    There is a column per joint position and velocity, named `R1 [rad]`, `P2 [m/s]` and
-    so on. Where elements hold joints, `R1 held by` names what holds the joint (`free`
-    if nothing does), and `taken [J]` is the energy that the elements have taken. The
-    last column is the `outcome` of the row's trajectory. The index is the time,
-    `time [s]`. For a batch, the levels before it are `batch` (or `batch_1`, `batch_2`
-    and so on).
+    Its columns are joint positions and velocities, named `R1 [rad]`, `P2 [m/s]` and so
+    on, and the `outcome` of the row's trajectory. Where elements hold joints, there is
+    a column `R1 held by` with what holds the joint (or `free`), and one of the energy
+    taken, `taken [J]`. The index is `time [s]`, after the levels `batch` (or `batch_1`,
+    `batch_2` and so on) of a batch.
 
     **Arguments:** as in `to_xarray`.
-
-    **Returns:** the DataFrame.
 
     **Raises:** ImportError without pandas, which `fdof_jax[data]` installs; ValueError
     for malformed arguments.

@@ -39,13 +39,12 @@ _ENOUGH = 1e-5  # a search stops when the loss falls by less than this part
 
 
 class NextMotion(Report):
-    """The motion to record next; prints itself in a few lines.
+    """The motion to record next; prints itself.
 
     - `motion`: its numbers by name, for `experiment`.
-    - `standard_errors`: expected standard errors by name [unit of each parameter], if
-      this motion is recorded and fitted together with the earlier recordings.
-    - `improvement`: the largest relative standard error so far over the expected one
-      [1].
+    - `standard_errors`: those expected if all recordings are fitted together, by name
+      [unit of each parameter].
+    - `improvement`: largest relative standard error so far over the expected one [1].
     - `message`: why the search stopped.
     """
 
@@ -71,10 +70,7 @@ class NextMotion(Report):
 
 
 class _Design(NamedTuple):
-    """An experiment, and what earlier recordings say of its parameters.
-
-    `information` (n, n) is that on the parameters relative to their sizes.
-    """
+    """An experiment, and the `information` (n, n) so far on its relative parameters."""
 
     experiment: Callable[..., SceneAt]
     observe: Observe
@@ -131,37 +127,31 @@ def next_motion(
     max_steps: int = 1000,
     report: Callable[[str], object] | None = None,
 ) -> NextMotion:
-    """Computes the motion that cuts the largest standard error of a fit most.
+    """Finds the motion that most reduces the largest relative standard error of a fit.
 
-    A motion is a few named numbers, for instance efforts at knots, or amplitudes and
-    phases. The search follows the gradient of the largest relative standard error,
-    which the inverse of the information matrix gives. This matrix is that of the
-    earlier recordings, from the covariance of their fit, plus that of the new one at
-    the parameters found. The search finds the best motion near `start`; other starts
-    may lead to better ones.
+    A few named numbers describe a motion, such as efforts at knots. Standard errors are
+    those expected of a fit of all recordings, at the parameters found. The search finds
+    the best motion near `start`; other starts may lead to better ones.
 
     **Arguments:**
 
-    - `experiment`: called with the motion's numbers by name, returns the `scene_at` of
-      `fit`, for instance a class of Equinox modules.
-    - `found`: the `FitResult` of the earlier recordings. Parameters in combinations
-      that these do not determine count as unknown one by one.
+    - `experiment`: takes the motion's numbers by name and returns the `scene_at` of
+      `fit`; for instance a class of Equinox modules.
+    - `found`: the `FitResult` of the earlier recordings. Parameters determined only in
+      combination count as unknown.
     - `start`: first guess of the motion's numbers, strictly within all limits.
     - `ts`: increasing times of the new recording (time,) [s].
-    - `noise`: standard deviation of its readings [their unit], as in `fit`.
-    - `bounds`: (least, greatest) of the motion's numbers by name, finite.
-    - `within`: `(scene, solution) -> array` of numbers that have to stay between -1 and
-      1, for instance speeds over their limits.
-    - `observe`: as in `fit`.
+    - `noise`: standard deviation of its readings, as in `fit` [their unit].
+    - `bounds`: finite (least, greatest) of the motion's numbers by name.
+    - `within`: `(scene, solution) -> array` of numbers to keep between -1 and 1, such
+      as speeds over their limits.
+    - `observe`, `report`: as in `fit`.
     - `scale`: sizes of parameters by name, to which standard errors are relative; by
       default the magnitudes found.
     - `max_steps`: greatest number of evaluations after the first.
-    - `report`: called with a line of progress after each step, for instance `print`.
 
-    **Returns:** a `NextMotion`.
-
-    **Raises:** ValueError for malformed arguments, and if `start` does not stay within
-    the limits or cannot be simulated.
+    **Raises:** ValueError for malformed arguments, and if `start` exceeds the limits or
+    cannot be simulated.
     """
     if not callable(experiment):  # which may be a class
         raise refusal("experiment", "a callable", experiment)
@@ -221,7 +211,7 @@ def next_motion(
 
 
 def _information(covariance: np.ndarray) -> np.ndarray:
-    """Inverse of a covariance that may have infinite rows, which say nothing."""
+    """Inverse of a covariance, whose infinite rows say nothing."""
     finite = np.isfinite(np.diag(covariance))
     information = np.eye(len(covariance)) / _IGNORANCE**2
     part = np.ix_(finite, finite)

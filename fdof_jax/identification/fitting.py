@@ -1,4 +1,4 @@
-"""Identification: parameters of a scene from recordings of its motion."""
+"""Identification of a scene's parameters from recordings of its motion."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -52,7 +52,7 @@ def _longer_and_longer(
     z, low, high = unknowns.box(len(rows))
 
     def lanes_until(share: float) -> Lanes:
-        """The lanes with weights for readings up to this share of the time only."""
+        """The lanes with weights up to this share of the time only."""
 
         def shortened(problem: Problem) -> Problem:
             ts, weight = np.asarray(problem.ts), problem.weight
@@ -77,10 +77,7 @@ def _search(
     scene_at, observed, start, ts, together: bool, *, observe, noise, validate, bounds,
     scale, **search: Any,
 ) -> list[FitResult]:  # fmt: skip
-    """Fits all recordings `together` in one result, or returns one result for each.
-
-    The other arguments are those of `fit`.
-    """
+    """Fits all recordings `together` in one result, or each in its own."""
     unknowns = unknowns_of(start, bounds, scale)
     settings = unknowns, check_times(ts), observe, 1.0 if noise is None else noise
     problems = problems_of(("scene_at", "observed"), scene_at, observed, *settings)
@@ -141,42 +138,34 @@ def fit(
 ) -> FitResult:
     """Fits parameters of a scene to recordings of its motion, by least squares.
 
-    Parameters may be masses, inertias, offsets, damping, starting positions: anything
-    in a scene. The fit uses the Levenberg-Marquardt method with exact derivatives. It
-    fits the first quarter of the time, continues with the first half, and so on, up to
-    all of it. A second call with other numbers compiles nothing, if `scene_at` and
+    Parameters may be anything in a scene, such as masses, damping or starting
+    positions. The Levenberg-Marquardt method fits the first quarter of the time, then
+    half, three quarters and all of it. Later calls compile nothing if `scene_at` and
     `observe` are functions of equal code or Equinox modules of the same structure.
 
     **Arguments:**
 
-    - `scene_at`: returns the scene for a dict of named parameters (numbers or arrays);
-      the scene's `t1` is ignored. For several scenes, fitted together with a recording
-      each: a list of Equinox modules that differ only in numbers.
-    - `start`: first guess of each parameter, in its own SI unit.
-    - `ts`: increasing times (time,) [s]. The motion starts at `ts[0]`, in the scene's
-      state. For a recording that begins later, keep the time of the start, with NaN
-      for its readings.
-    - `observed`: the recording, of the shape that `observe` returns; recordings of
-      several scenes are stacked along a leading axis. NaN marks a missing sample.
-    - `observe`: `(scene, solution) -> readings`, an array with time as first axis. By
-      default `link_ends`, markers (time, 3, 2) at the ends of the moving links [m]; use
-      `lambda scene, solution: solution.q` for joint encoders.
-    - `noise`: standard deviation of a reading [its unit], one number or an array that
-      broadcasts to a recording. If None, all readings weigh the same, and the noise is
-      estimated: for standard errors from all residuals; for the verdict from changes
-      between successive residuals, because errors of a model change slowly. Readings
-      that cannot be wrong, such as those of a fixed pair, are left out.
-    - `validate`: held-out recordings as (scene_at, observed), one pair or a list, at
-      the same times. The result compares their residuals with the noise. Choose motions
-      unlike the fitted ones.
+    - `scene_at`: returns the scene for a dict of named parameters; its `t1` is ignored.
+      To fit several scenes together, with a recording each, give a list of Equinox
+      modules that differ only in numbers.
+    - `start`: first guess of each parameter, a number or an array [its SI unit].
+    - `ts`: increasing times (time,) [s]. The motion starts at `ts[0]`; if readings
+      begin later, keep this time, with NaN readings.
+    - `observed`: the recording, of the shape that `observe` returns; several are
+      stacked along a leading axis. NaN marks a missing reading.
+    - `observe`: `(scene, solution) -> readings`, (time, ...). By default `link_ends`
+      [m]; for joint encoders use `lambda scene, solution: solution.q`.
+    - `noise`: standard deviation of a reading [its unit], which must broadcast to a
+      recording. By default all readings weigh the same, and the noise is estimated: for
+      standard errors from the residuals, for the verdict from their changes between
+      successive times.
+    - `validate`: held-out (scene_at, observed) at the same times, best of motions
+      unlike the fitted ones. The result compares their residuals with the noise.
     - `bounds`: (least, greatest) of parameters by name.
     - `scale`: sizes of parameters by name; a step changes a parameter by at most two
       sizes. By default the magnitudes of the start, which then must not be 0.
     - `max_steps`: greatest number of evaluations after the first, of each search.
-    - `report`: called with a line of progress after each step, for instance `print`.
-
-    **Returns:** a `FitResult`: a verdict on whether to use the parameters, their
-    standard errors, and the combinations that the motion does not determine.
+    - `report`: called with a line of progress after each step, such as `print`.
 
     **Raises:** ValueError for malformed arguments, and if the scene cannot be simulated
     from the start.
@@ -195,12 +184,10 @@ def fit_each(
     observed: ArrayLike,
     **keywords: Any,
 ) -> list[FitResult]:
-    """Fits each of several recordings, in one compiled program.
+    """Fits each of several recordings on its own, in one compiled program.
 
-    **Arguments:** `observed`: with recordings as leading axis, for instance markers
-    (recording, time, 3, 2) [m]; the others as in `fit`.
-
-    **Returns:** a list of `FitResult`s.
+    **Arguments:** as in `fit`, but `observed` has a leading axis of recordings, for
+    instance (recording, time, link, 2) [m].
 
     **Raises:** ValueError as `fit`; TypeError for unknown keywords.
 

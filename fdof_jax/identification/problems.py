@@ -1,4 +1,4 @@
-"""Problems of fitting: named unknowns, recordings of motions, and their misfit."""
+"""Problems of fitting: named unknowns, recordings, and their misfit."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -32,8 +32,7 @@ _TOLERANCE = 1e-9
 class Unknowns(NamedTuple):
     """First guess, size and bounds of all numbers, (n,) each.
 
-    A search's own unknowns z are numbers over their sizes. `shapes` holds the name and
-    the shape of each parameter.
+    A search's unknowns z are numbers over their sizes.
     """
 
     shapes: tuple[tuple[str, tuple[int, ...]], ...]  # JAX would sort a dict
@@ -52,7 +51,7 @@ class Unknowns(NamedTuple):
         )
 
     def named(self, numbers: Array | np.ndarray) -> Named:
-        """Splits numbers (n,) into arrays by the names of parameters."""
+        """Splits numbers (n,) into parameters by name."""
         arrays, place = {}, 0
         for name, shape in self.shapes:
             size = math.prod(shape)
@@ -79,7 +78,7 @@ def unknowns_of(
     bounds: Bounds | None,
     scale: Mapping[str, ArrayLike] | None,
 ) -> Unknowns:
-    """Checks and completes the arguments `start`, `bounds` and `scale` of `fit`."""
+    """Checks and completes `start`, `bounds` and `scale` of `fit`."""
     if not isinstance(start, Mapping) or not start:
         expected = "a dict of named parameters to find, for instance {'mass': 2.0}"
         raise refusal("start", expected, start)
@@ -122,9 +121,7 @@ def unknowns_of(
 
 
 def link_ends(scene: Scene, solution: Solution) -> Float[Array, "time link 2"]:
-    """Computes positions of markers at the links' ends: the next joints, and the tip.
-
-    **Arguments:** `scene`; `solution`: its motion.
+    """Computes the positions of the links' ends: the next joints, and the tip.
 
     **Returns:** points (x, y) from the ground pivot [m].
 
@@ -207,7 +204,7 @@ def problems_of(
     observe: Observe,
     noise: ArrayLike,
 ) -> list[Problem]:
-    """Checks a scene and its recording, or lists of both, arguments of given names."""
+    """Checks a scene and its recording, or lists of both."""
     numbers = "an array of real numbers"
     try:
         readings = np.asarray(array_of(observed))

@@ -1,4 +1,4 @@
-"""Results of identification: parameters, their errors, and undetermined directions."""
+"""Results of identification: parameters, their errors, undetermined directions."""
 
 import jax
 import jax.numpy as jnp
@@ -29,38 +29,31 @@ _SHARED = 1e-6
 
 
 class FitResult(Report):
-    """Identified parameters and their standard errors; prints itself as a table.
+    """Identified parameters and their standard errors; prints a verdict and a table.
 
-    The first line printed is a verdict: whether a fault is known.
-
-    - `parameters`: values by name, in the unit of each, as in `start`.
-    - `standard_errors`: standard errors by name, computed as if there were no bounds;
-      infinite for parameters that the motion does not determine.
-    - `names`: name of each number in order, for instance `damping` or `mass[0]`.
-    - `covariance`: covariance of the numbers in that order (n, n): the variance of the
-      noise times the inverse of the Gauss-Newton matrix. Infinite between parameters of
+    - `parameters`, `standard_errors`: by name, in the units of `start`. Standard errors
+      disregard bounds; they are infinite for parameters that the motion does not
+      determine.
+    - `names`: name of each number, for instance `mass[0]`.
+    - `covariance`: covariance of these numbers (n, n), infinite between parameters of
       which only a combination is determined.
-    - `weak`: combinations of parameters that the motion hardly determines, in words:
-      those without effect on it, and those whose standard error exceeds their size (a
-      parameter's size is the greater of its value and its scale).
-    - `rms`: root mean square of the residuals without missing samples [as observed].
-    - `noise`: root of the residuals' weighted sum of squares over the degrees of
-      freedom. This is relative to the given noise [1], or estimates the noise if none
-      is given [as observed].
+    - `weak`: in words, combinations of parameters that do not affect the motion, or
+      whose standard error exceeds their size (the greater of value and scale).
+    - `rms`: root mean square of the residuals [as observed].
+    - `noise`: root of the weighted sum of squares over the degrees of freedom: relative
+      to the given noise [1], or an estimate of it if none is given [as observed].
     - `converged`: whether a further step would change the parameters by less than 3 %
-      of their standard errors, or a millionth of their sizes. True also if the motion
-      does not determine some of them (see `weak`), which then stay where they are.
+      of their standard errors, or a millionth of their sizes. Parameters that the
+      motion does not determine do not count.
     - `message`: why the search stopped, and warnings.
-    - `history`: weighted sum of squares over all of the recording, at the start of the
-      last search (the result over three quarters of it) and at each accepted point.
-    - `held_out`: root mean square of the residuals of each recording given as
-      `validate`, relative to the noise [1]. Without a given noise, the noise here is
-      not `noise`, but the estimate from changes between successive residuals.
-    - `faults`: reasons not to use the parameters, in words: a search that has not
-      converged, combinations that are `weak`, residuals well above the noise of
-      `held_out`, and held-out residuals above it. Held-out residuals may exceed this
-      noise by a tenth and three standard deviations. Errors of the parameters add to
-      them, by a factor that is named.
+    - `history`: weighted sum of squares over the whole recording, at the start of the
+      last search and at each accepted point.
+    - `held_out`: rms residual of each recording of `validate` over the noise [1], which
+      is given, or else estimated from changes between successive residuals.
+    - `faults`: reasons not to use the parameters, in words: no convergence, `weak`
+      combinations, no scene with these parameters, residuals above 1.5 times the noise
+      (see `held_out`), and held-out residuals above 1.1 times this noise by more than
+      three standard deviations.
     """
 
     parameters: Named
@@ -78,7 +71,7 @@ class FitResult(Report):
 
     @property
     def usable(self) -> bool:
-        """True if no fault is known, which says little without held-out recordings."""
+        """Whether no fault is known, which says little without held-out recordings."""
         return not self.faults
 
     def _verdict(self) -> list[str]:
@@ -109,7 +102,7 @@ class FitResult(Report):
 
 
 def _digits(value: float, error: float) -> int:
-    """Returns how many digits to print: two more than the standard error makes sure."""
+    """Returns how many digits to print: two more than the error makes sure."""
     if not (value and 0 < error < np.inf):
         return 5
     return int(np.clip(np.ceil(np.log10(abs(value) / error)) + 2, 3, 10))
@@ -118,8 +111,7 @@ def _digits(value: float, error: float) -> int:
 def inverse_and_null_space(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A generalised inverse of a semidefinite matrix, and its null space in columns.
 
-    Directions are null if, with the diagonal scaled to 1, their curvature is below a
-    thousand rounding errors of the greatest.
+    Null directions have a curvature below a thousand rounding errors of the greatest.
     """
     limit = 1e3 * float(jnp.finfo(float).eps)
     diagonal = np.diag(normal)
@@ -135,7 +127,7 @@ def inverse_and_null_space(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _sparse(columns: np.ndarray) -> np.ndarray:
-    """Directions that span the same space, in echelon form: few numbers in each row."""
+    """Directions that span the same space, in echelon form."""
     if not columns.size:
         return columns.T
     _, rows, order = scipy.linalg.qr(columns.T, pivoting=True)
@@ -175,8 +167,8 @@ def _in_words(labels, undetermined, covariance) -> tuple[str, ...]:
 def _noise_by_changes(run: Run, problems: list[Problem]) -> tuple[float, float]:
     """Estimates the noise from changes between successive residuals of a fit.
 
-    The errors of a model change slowly, so that they hardly count. Returns the estimate
-    [as observed], and its relative variance.
+    The errors of a model change slowly, so they hardly count. Returns the estimate [as
+    observed] and its relative variance.
     """
     facts = {name: values.sum() for name, values in run.best.facts.items()}
     pairs, count = facts["pairs"], max(facts["readings"], 1)
@@ -189,7 +181,7 @@ def _noise_by_changes(run: Run, problems: list[Problem]) -> tuple[float, float]:
 
 
 def _wraps(problem: Problem) -> bool:
-    """Returns whether successive readings jump by a turn, as angles that wrap."""
+    """Returns whether successive readings jump by a turn."""
     there = problem.weight > 0
     jumps = np.abs(np.diff(problem.observed, axis=0))
     near = np.abs(jumps - 2 * np.pi) < _NEAR_A_TURN
@@ -203,7 +195,7 @@ def fit_result(
     noise_given: bool,
     held_out: Evaluation | None,
 ) -> FitResult:
-    """Judges the end of a run, where `held_out` evaluates recordings kept back."""
+    """Judges the end of a run; `held_out` evaluates the recordings of `validate`."""
     _, _, scale, low, high = unknowns
     values = unknowns.numbers(run.z)
     sizes = np.maximum(np.abs(values), scale)

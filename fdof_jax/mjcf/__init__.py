@@ -1,1 +1,1 @@
-"""Models of MuJoCo: read, written, and the law of its actuators."""
+"""Models of MuJoCo, read and written."""

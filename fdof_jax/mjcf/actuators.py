@@ -1,4 +1,4 @@
-"""Actuators of a MuJoCo model: their laws, and the elements that act alike."""
+"""Actuators of a MuJoCo model, and the elements that act alike."""
 
 from typing import Any, NamedTuple
 
@@ -46,7 +46,7 @@ class _Row(NamedTuple):
 
 
 def _gear(read: Reader, chain: Chain, actuator: int) -> np.ndarray | None:
-    """Ratios of an actuator to the joint positions q; None if it acts elsewhere."""
+    """Ratios of an actuator to q; None if it acts elsewhere."""
     model, kinds = read.model, read.mujoco.mjtTrn
     target = model.actuator_trnid[actuator, 0]
     kind = kinds(int(model.actuator_trntype[actuator]))
@@ -58,7 +58,7 @@ def _gear(read: Reader, chain: Chain, actuator: int) -> np.ndarray | None:
 
 
 def sum_of(read: Reader, chain: Chain, tendon: int) -> np.ndarray | None:
-    """Ratios of a fixed tendon's length to q; None if others have a part in it."""
+    """Ratios of a fixed tendon's length to q; None if other joints take part."""
     model, wraps = read.model, read.path_of_tendon(tendon)
     if (model.wrap_type[wraps] != int(read.mujoco.mjtWrap.mjWRAP_JOINT)).any():
         return None
@@ -69,7 +69,7 @@ def sum_of(read: Reader, chain: Chain, tendon: int) -> np.ndarray | None:
 
 
 def inertias_of_actuators(read: Reader, chain: Chain) -> np.ndarray:
-    """Damping and armature that actuators of newer versions add to joints, (2, n)."""
+    """Damping and armature that newer actuators add to joints, (2, n)."""
     model, sums = read.model, np.zeros((2, len(chain.joints)))
     if "actuators" in read.drop or not hasattr(model, "actuator_armature"):
         return sums
@@ -88,7 +88,7 @@ def inertias_of_actuators(read: Reader, chain: Chain) -> np.ndarray:
 
 
 def actuators(read: Reader, chain: Chain, controls: ArrayLike | None) -> list[Element]:
-    """The actuators: PD controllers and efforts where these will do, or `Actuators`."""
+    """PD controllers and efforts where these will do, else `Actuators`."""
     model = read.model
     if controls is None:
         controls = model.key_ctrl[0] if model.nkey else np.zeros(model.nu)
@@ -143,7 +143,7 @@ def actuators(read: Reader, chain: Chain, controls: ArrayLike | None) -> list[El
 
 
 def _places(model: Model, actuator: int) -> range:
-    """Where the controls of an actuator are; newer versions have several of one."""
+    """Where an actuator's controls are; newer versions have several of one."""
     if not hasattr(model, "actuator_ctrladr"):
         return range(actuator, actuator + 1)
     first = int(model.actuator_ctrladr[actuator])

@@ -1,4 +1,4 @@
-"""The planar chain in a MuJoCo model: its joints, its plane, its links and its tip."""
+"""The planar chain in a MuJoCo model: joints, plane, links and tip."""
 
 import warnings
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from .. import Linkage
 from ..checks import plain, refusal
 from .source import Model
 
-Data = Any  # an `mujoco.MjData`
+Data = Any  # a `mujoco.MjData`
 _SLIDE, _HINGE, _OF_JOINTS = 2, 3, 2  # of MuJoCo's mjtJoint and mjtEq
 FAR = 1e9  # stands for infinity where MuJoCo wants a number
 _EXACT = 1e-9  # what is as far out of the plane is taken for rounding
@@ -25,11 +25,11 @@ class Chain(NamedTuple):
     """Where a model's chain is, and what its plane is.
 
     - `joints`: their ids; `names`, `places` (in qpos) and `rates` (in qvel), (n,).
-    - `links`: by body: 0 for the ground, 1, 2, ... for its link, -1 beside the chain.
+    - `links`: of each body: 0 for the ground, -1 beside the chain.
     - `signs`: (n,), -1 for hinges that turn against the first; q = signs * qpos.
     - `right`, `up`, `normal`: unit vectors; `gravity` [m/s^2] points against `up`.
     - `starts`: characteristic points of ground and links, (n + 1,); `turns`: angles
-      [rad], both at qpos = 0.
+      [rad]; both at qpos = 0.
     """
 
     joints: np.ndarray
@@ -46,12 +46,12 @@ class Chain(NamedTuple):
     turns: np.ndarray
 
     def plane(self, vectors: np.ndarray) -> Any:
-        """Components to the right and upwards of a vector, or of many."""
+        """Complex components of vectors: to the right and upwards."""
         return vectors @ self.right + 1j * (vectors @ self.up)
 
 
 class Reader(NamedTuple):
-    """A model, the kinds of its parts to leave out, and the lines of the account."""
+    """A model, the kinds of parts to leave out, and the lines of the account."""
 
     mujoco: ModuleType
     model: Model
@@ -63,17 +63,17 @@ class Reader(NamedTuple):
         return getattr(self.model, kind)(int(index)).name or str(int(index))
 
     def has(self, array: str, index: int) -> np.bool_ | bool:
-        """Whether numbers are not 0 in an array, which older versions may not have."""
+        """Whether an array, which older versions may lack, is not 0 there."""
         return hasattr(self.model, array) and np.any(getattr(self.model, array)[index])
 
     def disabled(self, *names: str) -> bool:
-        """Whether a flag, under one of its names, switches something off."""
+        """Whether a flag of one of these names switches something off."""
         flags = self.mujoco.mjtDisableBit.__members__  # some in some versions only
         bits = [int(flags[f"mjDSBL_{n}"]) for n in names if f"mjDSBL_{n}" in flags]
         return any(self.model.opt.disableflags & bit for bit in bits)
 
     def data_at_start(self) -> Data:
-        """MuJoCo's data in the first key frame, if there is one, or at qpos0."""
+        """MuJoCo's data in the first key frame if there is one, else at qpos0."""
         data = self.mujoco.MjData(self.model)
         if self.model.nkey:
             self.mujoco.mj_resetDataKeyframe(self.model, data, 0)
@@ -102,9 +102,9 @@ class Reader(NamedTuple):
     def bounds(
         self, kind: str, index: int | np.ndarray, signs: ArrayLike = 1
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Both ends of ranges, infinite where there is none, as at a `FAR` number.
+        """Both ends of ranges, infinite where there is none or it is `FAR`.
 
-        `kind`: before the names of the arrays, as jnt_ of jnt_range; `signs`: of q.
+        `kind` is the prefix of the arrays, as jnt_ of jnt_range.
         """
         limited = np.asarray(getattr(self.model, f"{kind}limited")[index], bool)
         ends = signs * getattr(self.model, f"{kind}range")[index].T
@@ -127,7 +127,7 @@ class Reader(NamedTuple):
 
 
 def planar_chain(read: Reader, tip: str | None) -> tuple[Linkage, Chain]:
-    """Reads the chain and its masses; raises ValueError for what is no planar chain."""
+    """Reads the chain and its masses; raises ValueError if there is none."""
     model = read.model
     pull = np.zeros(3) if read.disabled("GRAVITY") else model.opt.gravity
     if not np.isfinite(pull).all():
@@ -168,7 +168,7 @@ def _direction(vector: np.ndarray) -> str:
 
 
 def _named(read: Reader, name: str) -> tuple[int, str, int] | None:
-    """The body that a site or a body of this name is on, and which of both it is."""
+    """The body of a site or a body with this name, and which of both it is."""
     model, mujoco = read.model, read.mujoco
     site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, name)
     if site >= 0:
@@ -178,7 +178,7 @@ def _named(read: Reader, name: str) -> tuple[int, str, int] | None:
 
 
 def _joints_of_arm(read: Reader, tip: str | None) -> tuple[np.ndarray, np.ndarray]:
-    """The joints of the arm, and the link of each body; notes chains beside it."""
+    """The arm's joints, and the link of each body; notes chains beside it."""
     model, name = read.model, lambda body: read.name_of("body", body)
     welded, tree_of = model.body_weldid, model.body_treeid  # -1 of what stands still
     refuse = lambda what: ValueError(f"source: expected a planar chain, got {what}.")
@@ -313,8 +313,7 @@ def _linkage(
 ) -> tuple[Linkage, np.ndarray]:
     """The linkage with `q` = 0 where the links are, and the angles of its links.
 
-    A link before a slide is at right angles to it; all others are parallel to the next
-    one, so that positions of hinges are 0 there.
+    A link before a slide is at right angles to it, all others are parallel to the next.
     """
     starts, turns = chain.starts, [float(np.angle(tip - chain.starts[-1]))]
     for joint, slide in zip(chain.joints[::-1], slides[::-1]):

@@ -1,4 +1,4 @@
-"""Known numbers, as models of MuJoCo have them: in double precision."""
+"""Known numbers in double precision."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Force elements of a MuJoCo model: those of its joints and its tendons."""
+"""Force elements of a MuJoCo model: those of its joints and tendons."""
 
 from typing import Any
 
@@ -30,7 +30,7 @@ def elements_in_joints(read: Reader, chain: Chain) -> list[Element]:
     forces: list[Element] = []
 
     def add(kind: str, flags: str, element: type, *values: np.ndarray) -> None:
-        """Adds an element with values, unless all are 0, switched off or dropped."""
+        """Adds an element, unless its values are 0, switched off or dropped."""
         words = "left out, as asked" if kind in read.drop else element.__name__
         if words == "JointFriction":
             words += ", which holds still where MuJoCo's creeps"
@@ -54,7 +54,7 @@ def elements_in_joints(read: Reader, chain: Chain) -> list[Element]:
 
 
 def _stops(read: Reader, chain: Chain, limited: np.ndarray) -> list[Element]:
-    """Stops in the place of ranges, as stiff as MuJoCo's constraints are at qpos0."""
+    """Stops in place of ranges, as stiff as MuJoCo's constraints at qpos0."""
     model, dropped = read.model, "limits" in read.drop
     # MuJoCo's constraint acts from the margin within the range on.
     within = np.outer((1, -1), model.jnt_margin[chain.joints])
@@ -86,7 +86,7 @@ def _stops(read: Reader, chain: Chain, limited: np.ndarray) -> list[Element]:
 
 
 def springs_of_tendons(read: Reader, chain: Chain) -> list[Element]:
-    """Springs and dampers between two sites."""
+    """Springs and dampers of tendons, as elements."""
     model, forces = read.model, []
     no_limits = read.disabled("LIMIT", "CONSTRAINT")
     sprung, damped = (not read.disabled("PASSIVE", f) for f in ("SPRING", "DAMPER"))
@@ -130,7 +130,7 @@ def springs_of_tendons(read: Reader, chain: Chain) -> list[Element]:
 def _spring_of_sum(
     gear: np.ndarray, k: float, damping: float, low: float, high: float
 ) -> Actuators:
-    """A spring on a sum of joint positions, slack between two lengths; and a damper."""
+    """A spring, slack between two lengths, and a damper on a sum of positions."""
     bias = [[k * low, -k, 0], [k * high, -k, 0], [0, 0, -damping]]
     ends: Any = dict(lower=[0, -np.inf, -np.inf], upper=[np.inf, 0, np.inf])
     if low == high:
@@ -170,7 +170,7 @@ def _bodies_of(read: Reader, tendon: int) -> list[int]:
 
 
 def _ends(read: Reader, chain: Chain, tendon: int) -> tuple[Point, Point] | None:
-    """The points of a tendon between two sites of the arm, in its plane."""
+    """The points of a tendon between two sites in the arm's plane."""
     model, wraps = read.model, read.path_of_tendon(tendon)
     sites, kinds = model.wrap_objid[wraps], model.wrap_type[wraps]
     if len(sites) != 2 or (kinds != int(read.mujoco.mjtWrap.mjWRAP_SITE)).any():

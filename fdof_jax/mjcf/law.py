@@ -1,4 +1,4 @@
-"""Actuators as simulators and data sheets describe them: affine laws with limits."""
+"""The law of `Actuators`: affine, with limits and states."""
 
 from typing import Any
 
@@ -30,10 +30,10 @@ def _alike(name: str, values: tuple) -> Condition:
 class Activation(Part):
     """States s of `Actuators`, one each: a lag, an integrator, a current.
 
-    A state adds gain * s to the force, and ds/dt = rate . (control, s, length, speed),
-    which becomes 0 where it would leave [lower, upper].
+    A state adds gain * s to the force. Its rate is ds/dt = rate . (control, s, length,
+    speed), or 0 where s would leave [lower, upper].
 
-    **Arguments:** per actuator, in units that the control and the state decide.
+    **Arguments:** per actuator, in the units of control and state.
 
     - `gain`: (actuator,) [N or N m per unit of s]; `start`: s at the start (actuator,).
     - `rate`: (actuator, 4).
@@ -63,16 +63,14 @@ class Activation(Part):
 
 
 class Actuators(StatefulElement):
-    """Motors and servos that act on joints through gears, with limits of their own.
+    """Motors and servos that act on joints through gears, with their own limits.
 
     An actuator's length is gear . q, its speed gear . qd, and its force
 
         (gain . (1, length, speed)) control + bias . (1, length, speed)
 
-    clipped to [lower, upper]. The joints feel gear^T force, clipped to
-    [effort_lower, effort_upper]. These are the general actuators of MuJoCo, as
-    `from_mjcf` reads them. A `PDController` is simpler where it will do, and `tune` can
-    change it.
+    clipped to [lower, upper]. The joints feel gear^T force, clipped to [effort_lower,
+    effort_upper]. Prefer a `PDController` where it will do: `tune` can change it.
 
     **Arguments:** per actuator, in the units of its control.
 
@@ -81,7 +79,7 @@ class Actuators(StatefulElement):
     - `control`: (actuator,), or a function of time that returns it.
     - `lower`, `upper`: (actuator,) [N or N m]; by default infinite.
     - `effort_lower`, `effort_upper`: per joint [N or N m]; by default infinite.
-    - `activation`: an `Activation`; by default the actuators have no states.
+    - `activation`: an `Activation`; by default there are no states.
 
     **Raises:** ValueError for malformed arguments.
 

@@ -24,7 +24,7 @@ _NEGLIGIBLE = 1e-9
 
 
 class Account(NamedTuple):
-    """What `from_mjcf` made of each part of a model: a table that prints itself.
+    """What became of each part of a model: a table that prints itself.
 
     - `lines`: pairs of a part, and of what it became or why it was left out.
     """
@@ -61,35 +61,29 @@ def from_mjcf(
 ) -> MjcfModel:
     """Reads a planar chain of hinges and slides from a model of MuJoCo (MJCF or URDF).
 
-    The plane is seen from where the first hinge's axis points, with gravity downwards,
-    so that x may be -X of the model's world. `q` equals `qpos`, with the opposite sign
-    at hinges that turn the other way. A body with several joints becomes as many links,
-    all but the last without mass. What is welded, or locked by an equality, belongs to
-    its link. The arm is the chain with most actuators, or else most joints. Texts may
-    have what MuJoCo or ROS allow. MuJoCo reads them: `pip install "fdof_jax[test]"`.
-
-    What acts on the arm becomes elements that act alike, or nearly so: stops and
-    friction are soft in MuJoCo. What the library does not have is refused, or left out
-    by `drop`; the account says all of it.
+    The first hinge's axis points at the viewer and gravity downwards, so x may be -X of
+    the model's world. `q` equals `qpos`, or -`qpos` at hinges that turn the other way.
+    The arm is the chain of `tip`, or else that with most actuators, or else most
+    joints. The account says what became of each part. MuJoCo compiles the model:
+    `pip install "fdof_jax[test]"`.
 
     **Arguments:**
 
-    - `source`: an XML text, which may name no other files; the path of a file, an
-      `mujoco.MjModel` or an `mujoco.MjSpec`.
+    - `source`: an XML text, which may name no other files, or the path of a file, a
+      `mujoco.MjModel` or a `mujoco.MjSpec`.
     - `controls`: of the actuators, in MuJoCo's order and units; by default those of the
-      first key frame, or 0. `replace` changes them in the elements.
+      first key frame, or 0.
     - `tip`: name of the site or body that is the tip; by default one named tip, ee,
       tool, hand or end_effector on the last link, or else its last geom or body.
     - `drop`: kinds of parts to leave out: "actuators", "armature", "contacts",
       "damping", "equalities", "fluid", "friction", "gravcomp", "limits", "plugins",
       "springs", "tendons".
 
-    **Returns:** an `MjcfModel`: linkage, start (of the first key frame, or `qpos0`),
-    forces and account.
+    **Returns:** an `MjcfModel`, at the start of the first key frame or at `qpos0`.
 
-    **Raises:** ValueError for what is no planar chain (trees, loops, other joints, axes
-    out of the plane), for parts that are neither known nor to be dropped, and for
-    bodies that touch at the start. Warns of bodies that may touch later.
+    **Raises:** ImportError without MuJoCo. ValueError for what is no planar chain, for
+    parts neither known nor dropped, and for bodies that touch at the start. Warns of
+    bodies that may touch later.
 
     >>> import fdof_jax as fj
     >>> arm, start, forces, account = fj.from_mjcf('''
@@ -178,7 +172,7 @@ def _check_rest(read: Reader, chain: Chain) -> None:
 
 
 def _drag(read: Reader, chain: Chain) -> float:
-    """The force of the fluid over that of inertia, in a random state of size 1."""
+    """The fluid's force over that of inertia, in a random state of size 1."""
     model, rates, data = read.model, chain.rates, read.data_at_start()
     state = np.random.default_rng(0).normal(size=(2, len(rates)))
     data.qpos[chain.places], data.qvel[rates] = state
@@ -190,7 +184,7 @@ def _drag(read: Reader, chain: Chain) -> float:
 def _check_contacts(read: Reader, chain: Chain, robot: bool) -> None:
     """Raises ValueError for bodies that touch at the start, warns of those that may.
 
-    Of a `robot`, as in ROS, the ground and the first link do not collide either.
+    A `robot`, as in ROS, has no contacts between ground and first link.
     """
     model, mujoco, links = read.model, read.mujoco, chain.links
     if read.disabled("CONTACT", "CONSTRAINT"):
@@ -225,7 +219,7 @@ def _check_contacts(read: Reader, chain: Chain, robot: bool) -> None:
 def _may_collide(read: Reader) -> list[tuple[int, int]]:
     """Pairs of bodies whose geoms may collide in MuJoCo.
 
-    Bodies that are welded together do not, nor do neighbours but for the ground.
+    Bodies that are welded together do not, nor do neighbours other than the ground.
     """
     model, bodies = read.model, read.model.geom_bodyid
     pairs = zip(bodies[model.pair_geom1], bodies[model.pair_geom2])

@@ -1,4 +1,4 @@
-"""MuJoCo's compiled model of a text, a file, a specification or another model."""
+"""MuJoCo's compiled model of a text, a file, or a model."""
 
 import copy
 import os
@@ -12,9 +12,9 @@ from xml.parsers import expat
 
 from ..checks import plain, refusal
 
-Model = Any  # an `mujoco.MjModel`, of which type checkers know nothing
+Model = Any  # a `mujoco.MjModel`, of which type checkers know nothing
 Node = ElementTree.Element
-_EXPECTED = "an XML text, the path of a file, an mujoco.MjModel or an mujoco.MjSpec"
+_EXPECTED = "an XML text, the path of a file, a mujoco.MjModel or a mujoco.MjSpec"
 # MuJoCo reads bare ampersands, and dashes in comments; XML has neither.
 _LOOSE = re.compile(r"<!--.*?(?:-->|\Z)|&(?!#?\w+;)", re.DOTALL)
 # What is kept of a URDF. MuJoCo does not read others, or makes pictures of them.
@@ -28,7 +28,7 @@ _KEPT = {
 def compiled_model(mujoco: ModuleType, source: Any) -> tuple[Model, list[str], bool]:
     """Returns a model of its own, remarks on its source, and whether it was a URDF.
 
-    A text is read without opening files of the machine; a path finds its own.
+    A text may open no files.
     """
     if isinstance(source, mujoco.MjModel):
         return copy.copy(source), [], False
@@ -61,7 +61,7 @@ def _compiled(compile_model: Callable[[], Any]) -> Any:
 
 
 def _root(text: str) -> Node:
-    """Parses as leniently as MuJoCo: prefixes are parts of names, declared or not."""
+    """Parses as leniently as MuJoCo: prefixes, declared or not, are parts of names."""
     # Lines keep their numbers, for messages.
     strict = lambda found: "&amp;" if found[0] == "&" else "\n" * found[0].count("\n")
     text = _LOOSE.sub(strict, text.strip())
@@ -83,10 +83,7 @@ def _root(text: str) -> Node:
 def _of_root(
     mujoco: ModuleType, root: Node, folder: Path | None
 ) -> tuple[Model, list[str], bool]:
-    """A model; the files that a URDF names in its folder are passed on as bytes.
-
-    Without a `folder`, as of a text, no file may be named.
-    """
+    """A model with the files that it names; without a `folder` it may name none."""
     remarks: list[str] = []
     assets: dict[str, bytes] = {}
     meshes, robot = "", root.tag == "robot"
@@ -134,7 +131,7 @@ def child(node: Node, tag: str) -> Node:
 
 
 def _without_missing_meshes(spec: Any, folder: Path) -> list[str]:
-    """Takes missing meshes out of bodies whose masses are given; returns remarks."""
+    """Takes missing meshes out of bodies with given masses; returns remarks."""
     remarks: list[str] = []
     missing = {
         mesh.name or Path(mesh.file).stem: mesh

@@ -50,27 +50,20 @@ _COLOURS = "0.2 0.4 0.7 1", "0.8 0.5 0.2 1"  # of links in turn
 def to_mjcf(
     linkage: Linkage, forces: tuple[Any, ...] = (), state0: State | None = None
 ) -> str:
-    """Exports a linkage and its force elements, or a scene, as a MuJoCo model (MJCF).
+    """Writes a linkage and its force elements, or a scene, as a MuJoCo model (MJCF).
 
-    Joints `joint1`, `joint2`, ... are hinges about z and slides in the plane z = 0,
-    with `qpos` equal to this library's `q` without fixed pairs. A site `tip` marks the
-    tip. Links are drawn, and nothing collides. Masses and moments of inertia below
-    1e-15, in particular zero, become 1e-15, the smallest that MuJoCo accepts.
+    Joints `joint1`, `joint2`, ... are hinges about z and slides in the plane z = 0;
+    `qpos` equals `q` without fixed pairs. A site `tip` marks the tip. Nothing collides.
+    Masses and inertias below 1e-15 become 1e-15, MuJoCo's least. The model asks for RK4
+    with steps of 1 ms.
 
-    Elements act as they do here: a `JointEffort` as motors `effort1`, ..., a
-    `SpringDamper` as a spatial tendon, a `PDController` as `position1`, `velocity1`,
-    ..., whose sum the joint limits. The controls at time 0, those of a reference for
-    instance, are in the key frame `start`, which also has `state0`; set `data.ctrl` as
-    a moving reference demands. The model asks for MuJoCo's RK4 with steps of 1 ms, as
-    its own default, Euler with 2 ms, is far less exact. MuJoCo has other models of
-    stops and friction: of `JointStops` and `HardStops` it takes the range alone and
-    stops softly by its own `solref`; of `JointFriction` the level alone, and joints
-    that stick creep. `from_mjcf` reads all of it.
+    A `JointEffort` becomes motors `effort1`, ...; a `SpringDamper` a spatial tendon; a
+    `PDController` actuators `position1`, `velocity1`, ..., whose sum the joint limits.
+    The key frame `start` has `state0` and the controls at time 0; set `data.ctrl` as a
+    moving reference demands. Stops keep their range, but are soft; friction keeps its
+    level, but joints that stick creep.
 
-    **Arguments:** `linkage`: one linkage with concrete values; `forces`: elements;
-    `state0`: the start. Or a scene, which holds all of them.
-
-    **Returns:** the XML text.
+    **Arguments:** `linkage`: one, with known values; `forces`; `state0`: the start.
 
     **Raises:** ValueError for traced or batched values, and for elements that MuJoCo
     does not have.
@@ -150,13 +143,13 @@ def _check_elements(
             others = [e for e in acting if e is not element and type(e) in _ACTUATORS]
             limits, _ = _limits_and_acts(element, linkage)
             if any((limits & _limits_and_acts(e, linkage)[1]).any() for e in others):
-                expected = "no limit of efforts beside others, as MuJoCo limits a sum"
+                expected = "no limit of efforts where others act; MuJoCo limits a sum"
         if expected:
             raise ValueError(f"forces[{k}]: expected {expected}, got {name}.")
 
 
 def _limits_and_acts(element: Any, linkage: Linkage) -> tuple[np.ndarray, np.ndarray]:
-    """In which joints an element of `_ACTUATORS` limits the effort, and acts, (n,)."""
+    """In which joints an actuator limits the effort, and acts, (n,)."""
     count = len(linkage.mass)
     if isinstance(element, JointEffort):
         return np.zeros(count, bool), np.asarray(element.tau, bool)
@@ -171,7 +164,7 @@ def _limits_and_acts(element: Any, linkage: Linkage) -> tuple[np.ndarray, np.nda
 def _draw(
     root: Node, bodies: list[Node], kinds: str, length: np.ndarray, locked: np.ndarray
 ) -> None:
-    """Capsules along links and lines along slides, that neither weigh nor collide."""
+    """Capsules along links and lines along slides, without mass or contacts."""
     add = ElementTree.SubElement
     visual = add(root, "visual")
     add(visual, "global", azimuth="90", elevation="-90")
@@ -205,7 +198,7 @@ def _add_spatial(
 
 
 def _of_joints(acting: tuple[Element, ...], linkage: Linkage) -> list[dict[str, str]]:
-    """Attributes of the joints that stand for elements."""
+    """Attributes of joints that stand for elements."""
     count = len(linkage.mass)
     joints: list[dict[str, str]] = [{} for _ in range(count)]
 
@@ -242,7 +235,7 @@ def _of_joints(acting: tuple[Element, ...], linkage: Linkage) -> list[dict[str, 
 def _ends(
     lower: Array | None, upper: Array | None, count: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Both ends of ranges, in numbers that MuJoCo takes, and whether one is finite."""
+    """Both ends of ranges, as MuJoCo takes them, and whether one is finite."""
     low = np.full(count, -np.inf) if lower is None else np.asarray(lower)
     high = np.full(count, np.inf) if upper is None else np.asarray(upper)
     bounded = np.minimum(abs(low), abs(high)) < FAR
@@ -319,7 +312,7 @@ def _add_actuators(
 def _general(
     element: Actuators, place: str, linkage: Linkage
 ) -> Iterator[tuple[np.ndarray, dict[str, str], float, list[float]]]:
-    """Yields gears, attributes of general actuators, controls and states, if any."""
+    """Yields gears, attributes, controls and states of general actuators."""
     gears, gains, bias = map(np.asarray, (element.gear, element.gain, element.bias))
     control = np.asarray(element.value_of("control", jnp.zeros(())))
     low, high, bounded = _ends(element.lower, element.upper, len(gears))

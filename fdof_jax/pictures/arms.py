@@ -20,15 +20,7 @@ from .elements import ELEMENT_STYLES, element_lines, element_marker
 
 
 class Geometry(NamedTuple):
-    """A linkage at all samples; points of the plane are complex numbers x + iy [m].
-
-    Link 0 is the ground, links 1 to n move; joint k is between links k - 1 and k.
-
-    - `angle`: absolute angles of links 0 to n [rad]: (time, n + 1).
-    - `kinds`: R, P or F of each joint.
-    - `points`: the corners of each part's line, (time, corner), by the names that
-      `draw_linkage` lists, in the order of drawing; NaN lifts the pen.
-    """
+    """The points of a linkage's parts, as `geometry` returns them."""
 
     angle: np.ndarray
     kinds: str
@@ -53,9 +45,14 @@ def geometry(
     """Computes the points of a linkage's parts along a motion, for other renderers.
 
     **Arguments:** `q`: joint positions (time, n) [m or rad]; `ts`: their times [s],
-    with which the `forces` that have a place are parts too, behind the arm.
+    without which `forces` are left out.
 
-    **Returns:** `Geometry(angle, kinds, points)`.
+    **Returns:** a tuple with these names:
+
+    - `angle`: absolute angles of links 0 (the ground) to n, (time, n + 1) [rad].
+    - `kinds`: R, P or F of each joint.
+    - `points`: corners x + iy of each part's line, (time, corner) [m], by the names of
+      `draw_linkage`, in the order of drawing; NaN lifts the pen.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig5().linkage
@@ -152,10 +149,10 @@ def draw_arm(
     color: ColorType | None = None,
     bare: bool = False,
 ) -> dict[str, Line2D]:
-    """Draws sample `i` and returns its lines by name; the name is also the `gid`.
+    """Draws sample `i` and returns its lines by name, which is also the `gid`.
 
-    If it is `bare`, only links and rails are drawn, without labels, and `alpha` mixes
-    their colours with white, so that nothing shines through where they overlap.
+    A `bare` arm has only links and rails, without labels; `alpha` then mixes colours
+    with white.
     """
     lines, labels = {}, set()
     for name, points in g.points.items():
@@ -203,7 +200,7 @@ class DrawnMotion(NamedTuple):
         return [self.path, *(line for arm in self.arms for line in arm.values())]
 
     def move(self, g: Geometry, indices: np.ndarray) -> None:
-        """Moves the lines to a motion of the same topology, at as many samples."""
+        """Moves the lines to as many samples of a motion of the same topology."""
         self.path.set_data(*xy(g.tip[: indices[-1] + 1]))
         for lines, i in zip(self.arms, indices):
             _place(lines, g, i)
@@ -212,7 +209,7 @@ class DrawnMotion(NamedTuple):
 def draw_motion(
     ax: Axes, g: Geometry, indices: np.ndarray, mass_centers: bool
 ) -> DrawnMotion:
-    """Draws the samples `indices` from faint to full, and the tip's path up to them."""
+    """Draws samples from faint to full, and the tip's path up to the last."""
     faint = np.linspace(0.2, 0.7, len(indices) - 1)
     arms = [
         draw_arm(ax, g, i, mass_centers, alpha, bare=True)

@@ -1,4 +1,4 @@
-"""Colours, figures, axes, legends and argument checks shared by all pictures."""
+"""Colours, figures, axes, legends and argument checks of all pictures."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -37,7 +37,7 @@ def reached(
 
 
 def ending(solution: Solution) -> str:
-    """Says in a legend when and why a motion ended early; "" if it did not."""
+    """When and why a motion ended early, for a legend; "" if it did not."""
     finite = np.isfinite(np.asarray(solution.q)).all(axis=1)
     if finite.all():
         return ""
@@ -46,7 +46,7 @@ def ending(solution: Solution) -> str:
 
 
 def mark_end(axes: Iterable[Axes], solution: Solution, last: float) -> None:
-    """Marks the last time reached, if a motion ended early, in axes over time."""
+    """Marks the last time reached if a motion ended early."""
     if text := ending(solution):
         for ax in axes:
             ax.axvline(last, color=ACCENT, ls=":", lw=1.2, label=text, gid="end")
@@ -105,7 +105,7 @@ def plane_axes(
 ) -> Axes:
     """Axes of equal scales; a new figure gets the proportions of the points.
 
-    `width`: of a new figure, of which `beside` is for a legend or a scale [inches].
+    `beside`: part of its `width` for a legend or a scale [inches].
     """
     corners = [part[~np.isnan(part)] for part in xy(points)]  # NaN lifts the pen
     low, high = (np.array([end(part) for part in corners]) for end in (np.min, np.max))
@@ -144,7 +144,7 @@ _LEGEND: Keywords = dict(frameon=False, handlelength=1.2)
 
 
 def legend(ax: Axes, *others: Axes) -> None:
-    """Adds a legend of all labels above the axes, where it hides nothing."""
+    """Adds a legend of all labels above the axes."""
     entries, figure = _entries((ax, *others)), figure_of(ax)
     figure.draw_without_rendering()  # with what was drawn since the last layout
     for rows in range(1, len(entries) + 1):
@@ -161,7 +161,7 @@ def legend(ax: Axes, *others: Axes) -> None:
 
 
 def figure_legend(fig: Figure) -> None:
-    """Adds one legend of all labels in the figure beside its axes, or replaces it."""
+    """Adds or replaces a legend of all labels in the figure, beside its axes."""
     for old in fig.legends:
         old.remove()
     entries = _entries(fig.axes)

@@ -1,13 +1,4 @@
-"""Pictures and animations of linkages in the plane, with matplotlib.
-
-Every function draws into the given axes (`ax`) or figure (`fig`), or into a new one,
-and returns it: pictures of one panel take and return axes, those of several a figure;
-`animate` and `animate_grid` return an animation. Nothing is shown or
-saved, and no global setting changes. A `solution` is that of one `simulate`, or of one
-`simulate_sampled`, whose forces are `(control, *forces)`; of a failed one, the samples
-reached are drawn. Link 0 is the ground, links 1, 2, ... move.
-Malformed arguments raise ValueError. Curves over time are in `plotting`.
-"""
+"""Pictures and animations of linkages in the plane, with matplotlib."""
 
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -86,26 +77,20 @@ def draw_linkage(
     """Draws one configuration, to scale.
 
     A link is a line along its vector A, bent by the fixed B where the next joint is
-    revolute. Real revolute joints are pins; real prismatic joints are carriages on a
-    rail of length B. Fictitious joints are not drawn. The tip is an orange dot. A mass
-    centre is a dot in its link's colour, joined to the link if it lies beside it.
+    revolute. Revolute joints are pins; prismatic joints are carriages on a rail of
+    length B. Fictitious joints are not drawn. The tip is an orange dot, a mass centre a
+    dot in its link's colour.
 
-    Force elements that have a place are drawn too: springs, dampers, cables (which hang
-    if slack), bumpers, cylinders, wrenches as arrows, payloads as boxes while they are
-    taken, stops (also `HardStops`) as bars at the ends of a joint's range, and the path
-    on which a controller leads the tip, dashed. `Brake`, `JointFriction`, and dampers
-    and springs of joints have no symbol. The longest arrow is that of the greatest
-    force. Thin lines join points beside a link to the link, and hatched ground holds
-    points of the ground.
+    Force elements that have a place are drawn too: springs, dampers, cables, bumpers,
+    cylinders, payloads, stops, wrenches as arrows (the longest for the greatest force),
+    and the commanded path of the tip, dashed.
 
-    **Arguments:** `q`: joint positions [m or rad]; `forces`: elements, drawn as they
-    are at time 0; `color`: common colour of all links, by default one per link;
-    `alpha`: opacity, 0 to 1; `mass_centers`: whether to draw them.
+    **Arguments:** `q`: joint positions [m or rad]; `forces`: drawn as they are at time
+    0; `color`: of all links, by default one each; `alpha`: opacity, 0 to 1.
 
-    **Returns:** the axes. The `gid` of a line names its part: "link 1", "pin 1",
-    "rail 2", "slider 2", "mass 3", "tip 3", "ground"; of an element, its kind and its
-    index: "spring 0", "cylinder 1". New axes have a legend above them, without pins and
-    ground.
+    **Returns:** the axes; new ones have a legend. The `gid` of a line names its part:
+    "link 1", "pin 1", "rail 2", "slider 2", "mass 3", "tip 3", "ground"; of an element,
+    its kind and its index: "spring 0".
     """
     check_linkage(linkage)
     instance("mass_centers", mass_centers, bool)
@@ -130,13 +115,11 @@ def chrono_cyclograph(
 ) -> Axes:
     """Draws configurations at equal time steps, from faint to full, and the tip's path.
 
-    The picture is that of the paper's Figs 3, 5 and 7. The last configuration has all
-    its parts, the others only links and rails. A dot on the path marks each step. A few
-    dots carry their time, where it hides nothing.
+    The paper's Figs 3, 5 and 7 are such pictures. Only the last configuration has all
+    its parts. A dot on the path marks each step; a few carry their time.
 
     **Arguments:** `every`: time step [s], at which the nearest samples are drawn;
-    `until`: last time, by default the solution's [s]; `mass_centers`: whether to draw
-    those of the last configuration.
+    `until`: last time, by default the solution's [s].
 
     **Raises:** ValueError for malformed arguments and for an `until` before the start.
     """
@@ -164,7 +147,7 @@ def chrono_cyclograph(
 
 
 def _write_times(ax: Axes, ts: np.ndarray, g: Geometry, indices: np.ndarray) -> None:
-    """Writes times beside tips, from the last one, where nothing else is drawn."""
+    """Writes times beside tips, from the last one, where they hide nothing."""
     point = figure_of(ax).dpi / 72
     drawn = [line.get_path().transformed(ax.transData) for line in ax.lines]
     boxes: list[Bbox] = []
@@ -189,7 +172,6 @@ def _write_times(ax: Axes, ts: np.ndarray, g: Geometry, indices: np.ndarray) -> 
 
 
 def _last(ts: np.ndarray, until: float | None) -> float:
-    """The last time to draw."""
     if until is None:
         return ts[-1]
     return min(ts[-1], float(real_array("until", until, (), minimum=float(ts[0]))))
@@ -205,8 +187,8 @@ def topology_grid(
     """Draws linkages side by side, each with a few configurations and its tip's path.
 
     **Arguments:** `motions`: title -> (linkage, its solution); `forces`: title ->
-    elements to draw, as in `draw_linkage`; `configurations`: number for each, evenly
-    spaced in samples from the first (faint) to the last.
+    elements to draw, as in `draw_linkage`; `configurations`: number for each, from the
+    first sample (faint) to the last.
     """
     count = whole_number("configurations", configurations, 2, np.iinfo(np.int32).max)
     geometries = _geometries(motions, forces)
@@ -231,17 +213,16 @@ def animate(
 ) -> FuncAnimation:
     """Animates a motion, with the path of the tip so far.
 
-    Each frame shows the nearest sample. If a motion needs more than `max_frames`, it is
-    shown with fewer frames per second.
+    Each frame shows the nearest sample. A motion that needs more than `max_frames` has
+    fewer frames per second.
 
     **Arguments:** `forces`: elements to draw, as in `draw_linkage`; `until`: last time,
-    by default the solution's [s]; `fps`: frames per second; `speed`: 2 shows the motion
-    twice as fast.
+    by default the solution's [s]; `fps`: frames per second; `speed`: 2 plays twice as
+    fast.
 
-    **Returns:** the animation; a notebook plays it if it is the last line of a cell.
-    In a new figure a legend names the parts. Keep the animation until it is shown.
-    `.save("motion.gif")` and `.save("motion.mp4")` write it with a progress bar, the
-    latter with ffmpeg. For a web page there is `fj.view`.
+    **Returns:** the animation, which you must keep until it is shown; last in a
+    notebook's cell, it plays. `.save("motion.gif")` writes it, and with ffmpeg
+    `.save("motion.mp4")`.
     """
     ts, q, _ = reached(linkage, solution)
     shown = ts <= _last(ts, until)
@@ -263,10 +244,8 @@ def animate_grid(
 ) -> FuncAnimation:
     """Animates linkages side by side; a linkage whose motion has ended stands still.
 
-    **Arguments:** `motions`: title -> (linkage, its solution); `forces`: title ->
-    elements to draw, as in `draw_linkage`; the others as in `animate`.
-
-    **Returns:** the animation, as in `animate`.
+    **Arguments:** `motions`, `forces`: as in `topology_grid`; the others as in
+    `animate`.
     """
     geometries = _geometries(motions, forces)
     pairs = list(geometries.values())
@@ -279,7 +258,7 @@ def animate_grid(
 def _geometries(
     motions: Mapping[str, tuple[Linkage, Solution]], forces: Mapping[str, tuple] | None
 ) -> dict[str, tuple[np.ndarray, Geometry]]:
-    """Times and geometry of each motion, with its force elements, by title."""
+    """Times and geometry of each motion and its elements, by title."""
     filled_mapping("motions", motions, "(Linkage, Solution)")
     if forces is not None:
         filled_mapping("forces", forces, "force elements")
@@ -300,7 +279,7 @@ def _geometries(
 def _panels(
     geometries: dict[str, tuple[np.ndarray, Geometry]], fig: Figure | None
 ) -> tuple[Figure, list[Axes]]:
-    """A figure with a grid of axes of the same limits, one per motion."""
+    """A figure with a grid of axes of equal limits, one per motion."""
     count = len(geometries)
     columns = min(4, count)
     rows = -(-count // columns)
@@ -372,7 +351,7 @@ def _animation(
 
 
 class _MotionAnimation(FuncAnimation):
-    """An animation that a notebook plays if it is the last line of a cell."""
+    """An animation that a notebook plays."""
 
     def __init__(
         self, figure: Figure, show: Callable[[int], Artist], count: int, pause: float,
@@ -383,10 +362,7 @@ class _MotionAnimation(FuncAnimation):
         self._count, self._pause, self._moving = count, pause, moving
 
     def save(self, filename: str | Path, *args: Any, **kwargs: Any) -> None:
-        """Writes a file, and a progress bar to the standard error output.
-
-        By default a GIF is written by pillow, and only what moves is drawn again.
-        """
+        """Writes a file with a progress bar; of a GIF it redraws only moving parts."""
         name = Path(filename).name
         if args or "writer" in kwargs:  # a notebook's, too, which shows no bar
             return super().save(filename, *args, **kwargs)

@@ -32,9 +32,7 @@ def element_lines(
 ) -> dict[str, np.ndarray]:
     """Lines (time, points) of the elements that have a place, as x + iy [m].
 
-    A line's name is its kind and the element's index; NaN lifts the pen. `f`: the arm's
-    frames at times `ts` [s]; `size`: its extent [m]. Arrows show forces of all wrenches
-    on one scale.
+    They are named by kind and index. `f`: the arm's frames; `size`: its extent [m].
     """
     given = elements_on(linkage, forces)
     for element in given:
@@ -77,7 +75,7 @@ def element_lines(
 
 
 def _commanded(element: Element) -> np.ndarray | None:
-    """The path on which a controller leads the tip, once around, or None."""
+    """The path, once around, on which a controller leads the tip, or None."""
     share = jnp.linspace(0, 1, 201)
     is_reference = lambda part: isinstance(part, Reference)
     for part in jax.tree.leaves(element, is_leaf=is_reference):
@@ -95,7 +93,7 @@ def _place(point: Point, f: Frames) -> np.ndarray:
 
 
 def _support(point: Point, arm: Linkage, f: Frames, size: float) -> list[np.ndarray]:
-    """Lines of a support: hatched ground, or a bracket from the link's line."""
+    """Lines of a support: hatched ground, or a bracket from the link."""
     place, link = _place(point, f), point.link
     if link == 0:
         hatches = [np.array([x, x - 0.7 - 0.9j]) for x in (-0.6, 0.4, 1.4)]
@@ -152,10 +150,7 @@ def element_marker(kind: str) -> Path:
 def _between(
     element: SpringDamper | Tension | LinearActuator, f: Frames, size: float
 ) -> tuple[str, list[np.ndarray]]:
-    """A spring, a damper or both; a cable, which hangs if slack; a bumper; a cylinder.
-
-    A tension is a straight line.
-    """
+    """The symbol of an element between two points; a slack cable hangs."""
     a, b, width = _place(element.a, f), _place(element.b, f), _WIDTH * size
     length = np.abs(b - a)
     unit = (b - a) / np.where(length > 0, length, 1)

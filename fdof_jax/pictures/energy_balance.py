@@ -1,4 +1,4 @@
-"""The energy balance of a motion: what there is, and what elements put in and take."""
+"""The energy balance of a motion."""
 
 import jax
 import numpy as np
@@ -20,9 +20,7 @@ def energy_balance(
 ) -> tuple[np.ndarray, dict[str, np.ndarray], np.ndarray]:
     """Returns times, energies by name, and what was there and put in, their sum [J].
 
-    Work is the trapezoidal integral of the power tau * qd from sample to sample, taken
-    over q as the integral of tau. It does not resolve what efforts do in between:
-    contacts, blows beside dampers, jumps, and commands that begin to act with a delay.
+    Work is the integral of tau over q, by the trapezoidal rule.
     """
     ts, q, qd = reached(linkage, solution)
     efforts = np.asarray(joint_efforts(linkage, forces, solution).elements)

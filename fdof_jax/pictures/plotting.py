@@ -1,9 +1,4 @@
-"""Curves of motions over time and of the tip's path, with matplotlib.
-
-The curves show joint motion, energies, efforts and tracking of a task (`tip_errors`).
-Arguments and results are as in `drawing`, which holds the pictures of the linkage
-itself.
-"""
+"""Curves over time and of the tip's path, with matplotlib."""
 
 from inspect import isfunction
 from itertools import cycle
@@ -63,14 +58,12 @@ def motion_profile(
 ) -> Figure:
     """Plots the motion of the joints over time, and the references that they follow.
 
-    One panel shows the angles of revolute joints [degrees], another the slides of
-    prismatic joints [m], by the joints' names. Dashed lines are references. A thick
-    line, "held" in the legend, marks where something holds a joint.
+    One panel shows angles [degrees], another slides [m]. Dashed lines are references. A
+    thick line, "held" in the legend, marks where something holds a joint.
 
     **Arguments:** `forces`: those of the solution, whose controllers have the
     references; `absolute`: whether to show the angle theta_k of each link k from the x
-    axis, as in the paper's Figs 4 and 6, instead of that from the link before; `title`:
-    of the figure.
+    axis, as in the paper's Figs 4 and 6.
     """
     ts, q, _ = reached(linkage, solution)
     instance("absolute", absolute, bool)
@@ -163,22 +156,16 @@ def energy_stack(
 ) -> Axes:
     """Plots the energy balance over time, stacked [J].
 
-    The stack is kinetic energy, potential energy above its least (springs and masses of
-    force elements included), and the energy taken out by the forces since the start.
-    The dashed line is the energy at the start plus the energy put in by the forces; it
-    is level if none is put in. The top of the stack lies on this line up to errors of
-    the motion and of the work between its samples, found by the trapezoidal rule. A
-    contact, a jump, or a command that begins to act between two samples is not
-    resolved: such a part of the picture needs closer samples.
+    The stack is kinetic energy, potential energy above its least, and the energy that
+    the forces have taken out since the start. The dashed line is the energy at the
+    start plus what the forces have put in. The top of the stack leaves this line where
+    samples are too far apart for the trapezoidal rule: near contacts, jumps and delayed
+    commands.
 
-    A force element puts energy in while its power is positive, and takes it out while
-    its power is negative. A motor may do both. `solution.taken` gives the energy taken
-    by friction, blows, brakes and catches since the start. A mass puts in its energy
-    when it arrives, and takes it out when it leaves, as a `Payload` that is let go.
-    Heights count from the ground pivot, so that a mass below it has a negative
-    potential energy.
-
-    **Arguments:** `forces`: those of the solution.
+    An element puts energy in while its power is positive, and takes it out while it is
+    negative. What friction, impacts, brakes and catches take is exact:
+    `solution.taken`. Masses that come and go bring and take their energy; heights count
+    from the ground pivot.
     """
     ts, bands, line = energy_balance(linkage, forces, solution)
     driven = np.ptp(line) > 1e-3 * line.max()  # more than errors of the work
@@ -198,12 +185,9 @@ def effort_profile(
 ) -> Figure:
     """Plots the efforts of each element over time, a panel per joint [N or N m].
 
-    The grey band lies within the finite limits of a controller, alone or in a drive,
-    where the efforts come near them; the label gives all limits. Orange dots mark
-    samples at which the controller is at its limit. If nearly all changes come in a
-    short part of the time, panels on the left enlarge it.
-
-    **Arguments:** `forces`: those of the solution.
+    A grey band shows a controller's finite limits where the efforts come near them; the
+    label gives all limits. Orange dots mark samples at a limit. If nearly all changes
+    come in a short time, panels on the left enlarge it.
     """
     last = reached(linkage, solution)[0][-1]
     efforts = joint_efforts(linkage, forces, solution)
@@ -259,15 +243,11 @@ def effort_profile(
 
 
 def _names(forces: tuple) -> list[str]:
-    """Returns the names of the elements' classes, of plain functions their own."""
     return [f.__name__ if isfunction(f) else type(f).__name__ for f in forces]
 
 
 def _busy(ts: np.ndarray, efforts: np.ndarray) -> tuple[float, float] | None:
-    """Returns a short part of the time in which nearly all changes are, if any.
-
-    `efforts`: (element, time, joint).
-    """
+    """Returns a short part of the time in which nearly all changes are, if any."""
     moves = np.abs(np.diff(efforts, axis=1))
     moves = moves / np.maximum(np.ptp(efforts, axis=1, keepdims=True), 1e-300)
     done = np.nan_to_num(moves).sum(axis=(0, 2)).cumsum()

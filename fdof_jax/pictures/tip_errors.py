@@ -1,4 +1,4 @@
-"""Pictures of the tip's path beside the commanded one, and of its distance from it."""
+"""Pictures of the tip's path and its distance from the commanded one."""
 
 from collections.abc import Mapping
 from itertools import cycle
@@ -66,10 +66,8 @@ def _tips(
 def _draw_commanded(
     ax: Axes, task: Reference, ts: np.ndarray, path: np.ndarray
 ) -> None:
-    """Draws the commanded path dashed above the others, which show in its gaps.
-
-    Dashes of a second turn would fill the gaps of the first.
-    """
+    """Draws one turn of the commanded path, dashed, above the others."""
+    # Dashes of a second turn would fill the gaps of the first.
     turning = task.timing if isinstance(task, TipTask) else task
     if isinstance(turning, CircleTask | Laps):
         path = path[ts <= ts[0] + abs(turning.period)]
@@ -84,11 +82,11 @@ def tracking(
 ) -> Axes:
     """Plots paths of the tip with the commanded path, dashed; dots are the starts.
 
-    In the axes of `chrono_cyclograph` it adds the commanded path of the paper's Fig 7.
-    Label the motion "tip" there, because its path is drawn already.
+    In the axes of `chrono_cyclograph` it completes the paper's Fig 7. Label the motion
+    "tip" there, because its path is drawn already.
 
     **Arguments:** `task`: a `CircleTask` or a `TipTask`, whose `tip(t)` is the
-    commanded tip position [m]; `solutions`: one curve per label.
+    commanded position [m]; `solutions`: one curve per label.
     """
     tips = _tips(linkage, task, solutions)
     ts, longest, _ = max(tips.values(), key=lambda tip: len(tip.ts))
@@ -107,12 +105,8 @@ def tracking_by_error(
 ) -> Axes:
     """Plots the path of the tip, coloured by its distance from its set point [mm].
 
-    The dashed line is the commanded path; the cross is the tip's start. Later turns
-    cover earlier ones.
-
-    **Arguments:** `task`: as in `tracking`.
-
-    **Returns:** the axes, with a colour bar beside them.
+    The commanded path is dashed; a cross marks the tip's start. Later turns cover
+    earlier ones.
     """
     ts, commanded, path = _tip(linkage, task, solution)
     error = 1000 * np.abs(path - commanded)

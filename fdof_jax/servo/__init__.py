@@ -1,1 +1,1 @@
-"""What control engineers ask of a servo: its loops, margins and responses."""
+"""Loops, margins and responses of servos."""

@@ -29,25 +29,23 @@ def open_loop(
     forces: tuple = (),
     t: ArrayLike = 0.0,
 ) -> "control.StateSpace":
-    """Breaks the loop of a controller at one joint's effort, about a configuration.
+    """Breaks the loop of a controller at one joint's effort, about rest at `q`.
 
-    The controller keeps acting in the other joints. Constant efforts hold the arm at
-    rest at `q`. For a controller with kinks, the slope there counts: at its limit it
-    has no gains, so place `q` near its reference.
+    The controller keeps acting in the other joints. At its limit it has no gains, so
+    place `q` near its reference.
 
     **Arguments:**
 
-    - `linkage`, `q`: the arm and its joint positions [m or rad].
-    - `controller`: a force element, for instance a `PDController`, a `PIDController`,
-      or a drive that holds one.
+    - `q`: joint positions [m or rad].
+    - `controller`: a force element, for instance a `PDController`, or a drive that
+      holds one.
     - `joint`: number of the joint, from 1.
-    - `forces`: further elements, without a state of their own.
-    - `t`: time at which controller and forces are evaluated [s].
+    - `forces`: further elements, without states.
+    - `t`: time at which controller and forces act [s].
 
-    **Returns:** the loop L(s) as a `control.StateSpace` with one input and one output,
-    for instance for `margins`, `control.bode_plot` or `control.nyquist_plot`. The state
-    holds positions [m or rad], velocities and the controller's own state.
-    `loop.feedback()` is the system with the loop closed again.
+    **Returns:** the loop L(s) as a `control.StateSpace`, for `margins` or
+    `control.bode_plot`. Its state holds positions [m or rad], velocities and the
+    controller's own state. `loop.feedback()` closes the loop again.
 
     **Raises:** ValueError for malformed arguments and within JAX's transformations.
 
@@ -69,17 +67,16 @@ def closed_loop(
     forces: tuple = (),
     t: ArrayLike = 0.0,
 ) -> "control.StateSpace":
-    """Linearises how a joint follows its reference, about a configuration.
+    """Linearises how a joint follows its reference, about rest at `q`.
 
-    Only this joint's reference changes, with its velocities and accelerations; the
-    controller holds the other joints. The response is L / (1 + L) only if the
-    controller acts on the error and its rate alone.
+    Only this joint's reference changes, with its velocity and acceleration. The
+    response is L / (1 + L) only if the controller acts on the error and its rate alone.
 
     **Arguments:** as in `open_loop`.
 
     **Returns:** the response T(s) of the joint's position to its reference as a
-    `control.StateSpace`, for instance for `bandwidth` or `control.step_response`. T is
-    0 for a controller without a known reference, such as a plain function.
+    `control.StateSpace`, for `bandwidth` or `control.step_response`. T is 0 for a plain
+    function, whose reference is unknown.
 
     **Raises:** ValueError as `open_loop`.
 
@@ -133,14 +130,14 @@ def _loop_of(
 class Margins(NamedTuple):
     """Distances of a loop from instability.
 
-    - `gain`: the factor nearest to 1 that makes the loop unstable. A factor below 1
-      means that the arm falls if the gains are too low.
-    - `phase`, `delay`: least change of the phase [rad], and least delay [s], that make
-      it unstable.
-    - `modulus`: least distance |1 + L| over all frequencies. If this distance is m, the
-      loop stays stable for factors from 1 / (1 + m) to 1 / (1 - m), and the phase
-      margin is at least 2 arcsin(m / 2).
-    - `crossover`: frequency of the phase margin, at which |L| = 1 [rad/s].
+    - `gain`: the factor nearest to 1 that makes the loop unstable. If it is below 1,
+      the arm falls when the gains are too low.
+    - `phase`, `delay`: least change of phase [rad] and least delay [s] that make it
+      unstable.
+    - `modulus`: least distance m = |1 + L| over all frequencies. The loop stays stable
+      for factors from 1 / (1 + m) to 1 / (1 - m), and the phase margin is at least 2
+      arcsin(m / 2).
+    - `crossover`: frequency of the phase margin, where |L| = 1 [rad/s].
     """
 
     gain: float
@@ -151,11 +148,11 @@ class Margins(NamedTuple):
 
 
 def margins(loop: "control.StateSpace") -> Margins:
-    """Computes the margins of an open loop with python-control.
+    """Computes the margins of an open loop.
 
     **Arguments:** `loop`: the result of `open_loop`.
 
-    **Returns:** `Margins` [1, rad, s, 1, rad/s], NaN if the closed loop is not stable.
+    **Returns:** `Margins` [1, rad, s, 1, rad/s], NaN if the closed loop is unstable.
     Where no change makes it unstable, margins are infinite and the modulus is 1.
 
     **Raises:** ValueError if `loop` is not a `control.StateSpace`.
@@ -189,13 +186,13 @@ def margins(loop: "control.StateSpace") -> Margins:
 
 
 def bandwidth(response: "control.StateSpace") -> float:
-    """Computes the frequency above which a joint follows 3 dB less than at rest.
+    """Computes the frequency at which a joint's response has dropped by 3 dB.
 
     **Arguments:** `response`: the result of `closed_loop`.
 
-    **Returns:** the least frequency at which |T| = 0.708 |T(0)| [rad/s]. It is infinite
-    if the joint follows at all frequencies, as with computed torque and an exact model,
-    and NaN if it does not follow at rest.
+    **Returns:** the least frequency at which |T| = 0.708 |T(0)| [rad/s]: infinite if
+    the joint follows at all frequencies, as under computed torque with an exact model;
+    NaN if it does not follow at rest.
 
     **Raises:** ValueError if `response` is not a `control.StateSpace`.
     """
@@ -215,11 +212,11 @@ def _slower(system: Loop, closed: Loop) -> tuple[Loop, float]:
     """Returns a system in units of time in which the closed loop's poles are around 1.
 
     Also returns the factor: the geometric mean of the poles' magnitudes [rad/s].
-    Polynomials of python-control else overflow: 11 of 58 loops of eight joints with
-    lags raised `LinAlgError`.
     """
     import control
 
+    # Polynomials of python-control else overflow: 11 of 58 loops of eight joints with
+    # lags raised `LinAlgError`.
     rates = np.abs(closed.poles())
     unit = float(np.exp(np.log(rates[rates > 0]).mean()))
     return control.ss(system.A / unit, system.B / unit, system.C, system.D), unit
@@ -234,20 +231,17 @@ def _crossings(system: "control.StateSpace") -> list[float]:
 
 
 def _modulus_margin(loop: Loop) -> float:
-    """Returns the least |1 + L| of a loop that is stable when closed.
-
-    Each pass looks between the frequencies at which 1 / |1 + L| passes its largest
-    value so far (Bruinsma and Steinbuch, 1990). Of 780 random loops of three joints, as
-    compared with eigenvalues of Hamiltonian matrices, none was wrong by more than 1e-5.
-    `control.stability_margins`, whose polynomial has twice the degree, missed the
-    minimum of 3 in 429 (0.99 for 0.14), and `control.norm` was wrong for 195 of 780.
-    """
+    """Returns the least |1 + L| of a loop that is stable when closed."""
     import control
 
     sensitivity: Loop = control.feedback(1, loop)
     size = lambda w: np.abs(sensitivity(1j * w))
     poles = sensitivity.poles()
     tried = np.append(np.abs(poles), np.abs(poles.imag))
+    # Each pass looks between the frequencies at which 1 / |1 + L| passes its largest
+    # value so far (Bruinsma and Steinbuch, 1990). Of 780 random loops of three joints
+    # none was wrong by more than 1e-5; `control.norm` was wrong for 195 of them, and
+    # `control.stability_margins` missed the minimum of 3 in 429.
     largest, peak = 0.0, size(tried).max(initial=1.0)  # 1 at infinity
     while peak > largest * (1 + _EXACT):
         largest = float(peak)

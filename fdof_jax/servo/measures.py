@@ -1,4 +1,4 @@
-"""Measures of the motion under a controller, against its reference."""
+"""Measures of a motion under a controller, against its reference."""
 
 from typing import Any
 
@@ -22,25 +22,22 @@ _STANDS = 1e-9  # changes of a reference that are less are none [m or rad]
 
 
 class Response(Report):
-    """Measures of how joints followed the reference of their controller; prints itself.
+    """How joints followed the reference of their controller; prints itself.
 
-    Measures of a step refer, as is usual, to the position at the last time, which a
-    load or friction may keep away from the reference (`steady_error`). They are NaN for
-    joints whose reference moves meanwhile, as with a `Pulse` or a `Ramp`, or has been
-    reached from the start.
+    Overshoot, rise and settling refer to the last position, which a load or friction
+    may keep away from the reference. They are NaN for joints whose reference moves
+    meanwhile (then `step` is too), or was reached from the start.
 
-    - `joints`: names of the moving joints, for instance R1.
-    - `step`: from where the joint was to the final reference (joint,) [m or rad].
-    - `overshoot`: greatest excess over the last position, as a share of the change up
-      to it (joint,).
+    - `joints`: names of the moving joints.
+    - `step`: from the first position to the final reference (joint,) [m or rad].
+    - `overshoot`: greatest excess over the last position, as a share of the change to
+      it (joint,).
     - `rise_time`: time from 10 to 90 % of that change (joint,) [s].
-    - `settling_time`: time after which the joint stays within 2 % of that change around
-      its last position (joint,) [s]; NaN if that is in the last tenth of the time or
-      never.
-    - `steady_error`: error of the last position from the reference (joint,) [m or rad].
-    - `largest_error`, `rms_error`: errors from the reference over all samples (joint,)
-      [m or rad].
-    - `saturated`: share of the samples at which the actuator is at its limit (joint,).
+    - `settling_time`: time after which the joint stays within 2 % of that change
+      (joint,) [s]; NaN if it settles in the last tenth of the time or never.
+    - `steady_error`: last position less the reference (joint,) [m or rad].
+    - `largest_error`, `rms_error`: over all samples (joint,) [m or rad].
+    - `saturated`: share of samples with the actuator at its limit (joint,).
     """
 
     joints: tuple[str, ...]
@@ -89,20 +86,16 @@ def response(
 ) -> Response:
     """Measures how a motion followed the reference of its controller.
 
-    Cubics between the samples of the motion resolve times more closely than the
-    samples.
-
     **Arguments:**
 
-    - `linkage`, `solution`: the arm and one motion of it, with ten samples or more in
-      the fastest swing.
+    - `solution`: one motion, with ten samples or more in the fastest swing.
     - `forces`: those of the solution; for `simulate_sampled`, `(control, *forces)`. One
-      of them is, or is a drive that holds, a `PDController`, `PIDController`,
-      `GravityFeedforward` or `ComputedTorque`.
-    - `since`: the time from which the motion counts, such as that of a step [s]; by
-      default all of it counts.
+      of them is a `PDController`, `PIDController`, `GravityFeedforward` or
+      `ComputedTorque`, or a drive that holds one.
+    - `since`: time from which the motion counts, such as that of a step [s]; by default
+      all of it counts.
 
-    **Raises:** ValueError for malformed arguments, for a motion that failed, and under
+    **Raises:** ValueError for malformed arguments, for a motion that failed, and within
     JAX's transformations.
 
     >>> import fdof_jax as fj
@@ -170,10 +163,7 @@ def response(
 def _controller(
     linkage: Linkage, forces: tuple, solution: Solution
 ) -> tuple[PDController, Array]:
-    """Returns the controller among elements, and its efforts along a motion.
-
-    It may be the command of a drive, whose states have the command's.
-    """
+    """Returns the controller among elements and in drives, and its efforts."""
     efforts = joint_efforts(linkage, forces, solution).elements
     given = elements_on(linkage, forces)
     found = [(k, c) for k, e in enumerate(given) if (c := controller_in(e)) is not None]
@@ -195,15 +185,15 @@ def _controller(
 def step_measures(
     ts: ArrayLike, change: ArrayLike, rate: ArrayLike, final: ArrayLike
 ) -> tuple[float, float, float]:
-    """Measures any response to a step, of the tip for instance, from its samples.
+    """Measures any response to a step, such as the tip's, from its samples.
 
-    **Arguments:** `ts`: times since the step (time,) [s]; `change`, `rate`: what
-    responds, less its first value, and its derivative (time,), between which cubics
-    are taken; `final`: the change that is meant to be.
+    **Arguments:** `ts`: times since the step (time,) [s]; `change`: the response less
+    its first value (time,); `rate`: its derivative (time,); `final`: the intended
+    change.
 
-    **Returns:** the overshoot as a share of the final change, the rise time [s] (NaN if
-    90 % is not reached), and the time after which the response stays within 2 % [s]
-    (NaN if it is not at the end); all NaN if `final` is 0 or others are not finite.
+    **Returns:** overshoot, as a share of the final change; rise time [s], NaN if 90 %
+    is not reached; settling time to 2 % [s], NaN if the response does not settle. All
+    are NaN if `final` is 0 or numbers are not finite.
 
     **Raises:** ValueError for malformed arguments.
     """

@@ -1,4 +1,4 @@
-"""Losses of a scene's motion, and their derivatives in its controller's gains."""
+"""Losses of a scene's motion, and their derivatives in the gains."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -29,7 +29,7 @@ Loss = Callable[[Scene, Solution], Array]
 
 
 def controller_of(scene: Scene) -> PDController:
-    """The PD controller of a scene; raises ValueError unless there is exactly one."""
+    """A scene's PD controller; raises ValueError unless there is exactly one."""
     found = [force for force in scene.forces if isinstance(force, PDController)]
     if len(found) != 1:
         kinds = ", ".join(type(force).__name__ for force in scene.forces)
@@ -41,7 +41,6 @@ def controller_of(scene: Scene) -> PDController:
 
 
 def with_controller(scene: Scene, element: Element) -> Scene:
-    """The scene with another force element in place of its controller."""
     controller = controller_of(scene)
     forces = (element if force is controller else force for force in scene.forces)
     return scene._replace(forces=tuple(forces))
@@ -67,7 +66,7 @@ def gains_of(scene: Scene) -> Array:
 
 
 def with_gains(scene: Scene, gains: Array) -> Scene:
-    """The scene with the rows of `gains` as its controller's kp and kd."""
+    """The scene with `gains`, rows kp and kd, in its controller."""
     controller = controller_of(scene)
     changed = eqx.tree_at(lambda c: (c.kp, c.kd), controller, (gains[0], gains[1]))
     return with_controller(scene, changed)
@@ -80,12 +79,11 @@ def _check_motion(scene: Scene, solution: Solution) -> None:
 
 
 def tip_errors(scene: Scene, solution: Solution) -> Float[Array, " residual"]:
-    """Computes tip errors over time, scaled so that their squares sum to the mean.
+    """Computes the tip error over time; its squares sum to the mean squared error.
 
-    **Arguments:** `scene`, whose PD controller must track a task with a `tip`;
-    `solution`: its motion.
+    **Arguments:** `scene`, whose PD controller must track a task with a `tip`.
 
-    **Returns:** x and y components [m], divided by the root of the number of times.
+    **Returns:** x and y components [m], over the root of the number of times.
 
     **Raises:** ValueError for malformed arguments.
 
@@ -112,15 +110,14 @@ def tip_deviation(
 
 
 def joint_errors(scene: Scene, solution: Solution) -> Float[Array, " residual"]:
-    """Computes joint errors over time, scaled so that their squares sum to the mean.
+    """Computes joint errors over time; their squares sum to the mean squared error.
 
-    This is a loss for controllers whose reference has no `tip`. It adds errors of
-    slides [m] and angles [rad] as they are. A joint with kp and kd 0 is not driven and
-    does not count.
+    Use it as a loss if the controller's reference has no `tip`. Errors of slides [m]
+    and angles [rad] add up as they are. Joints with kp and kd 0 do not count.
 
-    **Arguments:** `scene`, with exactly one `PDController`; `solution`: its motion.
+    **Arguments:** `scene`, with exactly one `PDController`.
 
-    **Returns:** q - q_ref [m or rad], divided by the root of the number of times.
+    **Returns:** q - q_ref [m or rad], over the root of the number of times.
 
     **Raises:** ValueError for malformed arguments.
 
@@ -156,7 +153,7 @@ def relative_demands(
 ) -> Float[Array, "time joint"]:
     """The controller's demands over its limits; 0 at fixed pairs and infinite limits.
 
-    Where a limit is 0, a demand other than 0 gives an infinity of its sign.
+    A demand over a limit of 0 is an infinity of its sign.
     """
     demanded = demands(controller, linkage, solution)
     limit = jnp.broadcast_to(controller.limit, demanded.shape)
@@ -174,11 +171,10 @@ def _demands_and_efforts(scene: Scene, solution: Solution) -> tuple[Array, Array
 
 
 class Tracking(Part):
-    """Mean squared tip error plus prices of effort, a loss for `tune`.
+    """Mean squared tip error plus prices of effort: a loss for `tune`.
 
-    The loss adds effort * mean((tau / limit)^2) and
-    effort_rate * mean((d(tau / limit)/dt)^2), each summed over the joints. Rates are
-    differences between output times, a thousandth of the run apart.
+    It adds effort * mean(u^2) and effort_rate * mean((du/dt)^2) with u = tau / limit,
+    summed over the joints. Rates are differences between output times.
 
     **Arguments:**
 
@@ -212,7 +208,7 @@ class Tracking(Part):
 
 
 class GainBox(NamedTuple):
-    """kp and kd of a start, their least and greatest values: (2, n) each."""
+    """kp and kd at the start, and their bounds: (2, n) each."""
 
     start: np.ndarray
     lower: np.ndarray
@@ -220,11 +216,10 @@ class GainBox(NamedTuple):
 
     @property
     def free(self) -> int:
-        """Returns how many gains the bounds leave free."""
         return int(np.sum(self.lower < self.upper))
 
     def at_bound(self, gains: np.ndarray) -> np.ndarray:
-        """Returns which of the free gains are held by a bound (2, n)."""
+        """Returns which free gains a bound holds (2, n)."""
         held = (gains <= self.lower) | (gains >= self.upper)
         return held & (self.lower < self.upper)
 
@@ -235,7 +230,7 @@ class GainBox(NamedTuple):
             return tuple(np.log(of_start(gains)).ravel() for gains in self)
 
     def gains(self, z: np.ndarray) -> np.ndarray:
-        """Returns the gains (..., 2, n) by the factors exp(z) (..., 2n)."""
+        """Returns the gains (..., 2, n) for log-factors z (..., 2n)."""
         gains = self.start * np.exp(z).reshape(*z.shape[:-1], *self.start.shape)
         # exp(log(bound)) is rounded.
         hair = 100 * np.finfo(jnp.result_type(float)).eps
@@ -247,7 +242,7 @@ class GainBox(NamedTuple):
 def gain_jacobian(
     z: Array, scene: Scene, loss: Loss, tolerance: float = TOLERANCE
 ) -> Sensitivities:
-    """Residuals of a loss and their derivatives in the logarithms of factors `z`."""
+    """Residuals of a loss and their derivatives in the log-factors `z` of the gains."""
     gains = gains_of(scene)
     scene_at = lambda z: with_gains(scene, gains * jnp.exp(z).reshape(gains.shape))
     residuals = lambda scene, solution: residuals_of(loss, scene, solution)
@@ -256,7 +251,7 @@ def gain_jacobian(
 
 
 def residuals_of(loss: Loss, scene: Scene, solution: Solution) -> Array:
-    """Returns what a loss returns as residuals (m,), whose squares are summed."""
+    """Returns a loss as residuals (m,), whose squares are summed."""
     value = loss(scene, solution)
     size = np.shape(value) if eqx.is_array_like(value) else ()
     value = real_array("loss(scene, solution)", value, size)
@@ -267,15 +262,15 @@ def residuals_of(loss: Loss, scene: Scene, solution: Solution) -> Array:
 
 
 def unusable_loss() -> ValueError:
-    """The error to raise for a loss that is not finite at the start."""
+    """The error for a loss that is not finite at the start."""
     return ValueError(
-        "loss: expected finite numbers, not negative if only one, with finite "
-        "derivatives, got others at the scene's own gains."
+        "loss: expected finite residuals, or one number that is not negative, with "
+        "finite derivatives, got others at the scene's own gains."
     )
 
 
 def evaluate_gains(z: Array, problem: tuple[Scene, Loss]) -> Evaluation:
-    """Evaluates a scene's loss and its derivatives: see `gain_jacobian`."""
+    """Evaluates a scene's loss and its derivatives in the log-factors `z`."""
     found = gain_jacobian(z, *problem)
     scene, solution = found.scene, found.solution
     demands, efforts = _demands_and_efforts(scene, solution)
@@ -292,7 +287,6 @@ def evaluate_gains(z: Array, problem: tuple[Scene, Loss]) -> Evaluation:
 
 
 def check_tuned(name: str, scene: Scene, loss: Loss) -> None:
-    """Raises ValueError unless the scene can be tuned by the loss."""
     check_scene(name, scene)
     function("loss", loss)
     check_known(name, scene)

@@ -22,19 +22,17 @@ _MOSTLY = 0.9
 
 
 class History(eqx.Module):
-    """The history of a run: entry 0 is its start, then one entry per accepted point.
+    """The course of a run: an entry for its start and one per accepted point.
 
-    - `loss`: mean squared tip error [m^2] with the default loss.
-    - `gradient_norm`: norm of the gradient in the logarithms of the gains, without
-      components held back by a bound.
+    - `loss`: in [m^2] with the default loss.
+    - `gradient_norm`: norm of the projected gradient in the logarithms of the gains.
     - `gains`: kp and kd, in joint order [N/m or N m/rad, N s/m or N m s/rad].
-    - `saturated`: share of the time that each actuator spends at its limit.
+    - `saturated`: share of the time that each actuator is at its limit.
     - `effort`: root mean square of each effort over its limit.
     - `tip_error`: rms tip error [m]; NaN for a reference without a `tip`.
-    - `wall_time`: time since the start of the search, compilation included [s].
+    - `wall_time`: time since the search began, compilation included [s].
 
-    For an ensemble, `saturated` and `effort` are means over the members, and
-    `tip_error` is the root of the mean square.
+    `saturated`, `effort` and the square of `tip_error` are means over an ensemble.
     """
 
     loss: Float[np.ndarray, " iteration"]
@@ -50,16 +48,16 @@ class TuneResult(Report):
     """A tuned scene and how it was reached; prints itself as a table.
 
     - `scene`: the scene with its tuned gains.
-    - `loss`: loss with the tuned gains [m^2 with the default loss].
-    - `histories`: `History` of each run, the first from the scene's own gains.
+    - `loss`: its loss [m^2 with the default loss].
+    - `histories`: a `History` per run; the first run starts from the scene's own gains.
     - `lower`, `upper`: the bounds of kp and kd (2, n).
-    - `converged`: whether three things hold: the run stopped by itself; no actuator was
-      at its limit most of the time; a change of the gains by 1 %, within the bounds,
-      would change the loss by less than a ten-thousandth, to first order.
-    - `message`: why the run stopped, and warnings, in words.
-    - `member_loss`, `member_tip_error`: loss (member,) and rms tip error (member,) [m]
-      of each member of the ensemble with the tuned gains.
-    - `settings`: method, solver, tolerance and dtype of the run.
+    - `converged`: whether all of this holds: the run stopped by itself; no actuator was
+      at its limit for more than 90 % of the time; a change of the gains by 1 %, within
+      the bounds, would change the loss by less than 0.01 %, to first order.
+    - `message`: why the run stopped, and warnings.
+    - `member_loss`, `member_tip_error`: loss and rms tip error [m] of each member of
+      the ensemble (member,).
+    - `settings`: method, solver, tolerance, samples and dtype of the run.
     """
 
     scene: Scene
@@ -104,23 +102,20 @@ class TuneResult(Report):
 
     @property
     def effort(self) -> float:
-        """Root mean square of the efforts over their limits, over time and joints.
-
-        Fixed pairs do not count.
-        """
+        """Root mean square of efforts over their limits, over time and joints."""
         return _mean_effort(self.scene.linkage, self.history.effort[-1])
 
     @property
     def tuned_gains(self) -> int:
-        """Number of gains that are tuned: all but zeros and those held by bounds."""
+        """Number of gains that are tuned: those whose bounds differ."""
         return self._box.free
 
     @property
     def table(self) -> dict[str, list]:
-        """Columns with one row per gain: `pandas.DataFrame(result.table)`.
+        """Columns with one row per gain, for `pandas.DataFrame(result.table)`.
 
-        The columns are `gain` and `joint`, for instance kp and R1; `unit`; the values
-        `start` and `tuned`; the bounds `least` and `greatest`; and `at_bound`.
+        They are `gain` (kp or kd), `joint`, `unit`, `start`, `tuned`, the bounds
+        `least` and `greatest`, and `at_bound`.
         """
         return gain_table(self.scene, self._box, self.gains)
 
@@ -180,7 +175,7 @@ class TuneResult(Report):
 
 
 def gain_rows(table: dict[str, list]) -> list[list[str]]:
-    """Returns a header and a row per gain of a `TuneResult.table`."""
+    """Returns a header, and a row per gain of a `TuneResult.table`."""
     rows = [["", "start", "tuned", "least", "greatest", ""]]
     for gain, joint, unit, *values, held in zip(*table.values()):
         cells = [f"{value:.5g}" for value in values]
@@ -204,7 +199,7 @@ def gain_table(scene: Scene, box: GainBox, tuned: np.ndarray) -> dict[str, list]
 
 
 def _mean_effort(linkage: Linkage, efforts: np.ndarray) -> float:
-    """Returns the root mean square of efforts (n,) over the joints that move."""
+    """Returns the root mean square of efforts (n,) over the moving joints."""
     return float(np.sqrt(np.mean(efforts[moving_joints(linkage)] ** 2)))
 
 
@@ -244,7 +239,7 @@ def result_of(
 
 
 def _message(scene: Scene, run: Run, history: History, box: GainBox) -> str:
-    """The reason for stopping, and what may look like convergence but is not."""
+    """Why the run stopped, and what only looks like convergence."""
     reason = run.reason
     if run.flat:
         reason = "the gradient is zero at the start"

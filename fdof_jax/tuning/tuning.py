@@ -1,4 +1,4 @@
-"""Tuning of PD gains by gradients through the simulation."""
+"""Tuning of gains within bounds."""
 
 from collections.abc import Callable
 
@@ -33,7 +33,7 @@ _ORDERS = {"mean": 1, "worst": 32}
 
 
 def _members(ensemble: Scene, scene: Scene, loss: Loss) -> list[Scene]:
-    """Checks the argument `ensemble` of `tune`, whose members get the scene's gains."""
+    """Checks `ensemble` of `tune`; its members get the scene's gains."""
     alike = lambda s: (joint_names(s.linkage), type(controller_of(s)).__name__)
     members = unstacked("ensemble", ensemble)
     for i, member in enumerate(members):
@@ -45,7 +45,7 @@ def _members(ensemble: Scene, scene: Scene, loss: Loss) -> list[Scene]:
 
 
 def _failure(members: list[Scene], first: Row, ensemble: bool) -> ValueError:
-    """The error to raise if no start can be evaluated, judged by the first start."""
+    """The error if no start can be evaluated, judged by the first."""
     failing = np.flatnonzero(~first.facts["simulated"])
     if failing.size == 0:
         return unusable_loss()
@@ -54,8 +54,8 @@ def _failure(members: list[Scene], first: Row, ensemble: bool) -> ValueError:
     end = float(members[index].t1)
     check_motion(name, members[index], [0.0, end])
     return ValueError(
-        f"{name}: expected derivatives up to t1 = {end:g} s with its own gains, "
-        "got a motion that can be simulated, but whose derivatives fail."
+        f"{name}: expected a motion with finite derivatives up to t1 = {end:g} s at "
+        "its own gains, got some that are not finite."
     )
 
 
@@ -80,43 +80,35 @@ def tune(
     max_steps: int = 50,
     report: Callable[[str], object] | None = None,
 ) -> TuneResult:
-    """Minimises a scene's loss in the gains of its PD controller, within bounds.
+    """Minimises a scene's loss over the gains of its PD controller, within bounds.
 
     The unknowns are the logarithms of kp and kd; gains of zero stay zero. Derivatives
-    are tangents of the motion, whose steps have a tolerance of 1e-5. The relative error
-    of derivatives is about 1e-6, or some 1e-4 if actuators are at their limits for
-    long. A second call with other numbers, another topology or another method compiles
-    nothing; a call with a loss function of other code does.
+    have a relative error of about 1e-6, or some 1e-4 if actuators are at their limits
+    for long. `tune` cannot be used within JAX's transformations.
 
     **Arguments:**
 
-    - `scene`: a scene with exactly one controller of gains: a `PDController`, a
-      `GravityFeedforward` or a `ComputedTorque`.
-    - `factor`: the gains stay within this factor of their start, above 1; by default 4.
-    - `bounds`: instead of a factor, the least and the greatest kp and kd: two arrays
-      (2, n), first row kp, second kd [N/m or N m/rad, N s/m or N m s/rad].
-    - `loss`: `(scene, solution) -> residuals`, an array whose sum of squares is
-      minimised. By default `tip_errors`: the mean squared tip error at 1001 equally
-      spaced times in [0, t1]. `Tracking` puts a price on effort. A scalar, never
-      negative, is minimised itself, but gives Levenberg-Marquardt little to go by.
-    - `ensemble`: scenes like `scene`, stacked along a leading axis (`stacked`). The
-      loss is then that of the ensemble with common gains, which start from those of
-      `scene`.
-    - `over`: "mean", the mean loss of the ensemble, or "worst", its worst as a power
-      mean of order 32.
-    - `method`: "levenberg-marquardt", or "l-bfgs" by optax.
-    - `starts`: number of runs: one from the scene's gains, the others from random gains
-      within the bounds. The best run counts.
-    - `seed`: seed of the random starts.
-    - `max_steps`: greatest number of evaluations of a run after the first.
-    - `report`: called with a line of progress after each step, for instance `print`.
+    - `scene`: with exactly one `PDController`, `GravityFeedforward` or
+      `ComputedTorque`.
+    - `factor`: the gains stay within this factor of their start; above 1, by default 4.
+    - `bounds`: instead of a factor, least and greatest gains: two arrays (2, n) with
+      the rows kp and kd [N/m or N m/rad, N s/m or N m s/rad].
+    - `loss`: `(scene, solution) -> residuals`, whose sum of squares is minimised. By
+      default the mean squared tip error at 1001 equally spaced times in [0, t1]. A
+      scalar, which must not be negative, is minimised itself; choose "l-bfgs" for it.
+    - `ensemble`: scenes like `scene`, from `stacked`. All get the same gains, which
+      start from those of `scene`.
+    - `over`: "mean" or "worst" loss of the ensemble; the worst is a power mean of order
+      32.
+    - `method`: "levenberg-marquardt" or "l-bfgs".
+    - `starts`: number of runs, of which the best counts. All but the first start from
+      random gains within the bounds.
+    - `seed`: of the random starts.
+    - `max_steps`: greatest number of evaluations per run after the first.
+    - `report`: called with a line of progress after each step, such as `print`.
 
-    `tune` cannot be used within JAX's transformations: NumPy decides its steps.
-
-    **Returns:** a `TuneResult`, whose `message` says why the search stopped.
-
-    **Raises:** ValueError for malformed arguments, and if the scene cannot be simulated
-    from its start.
+    **Raises:** ValueError for malformed arguments, and if the scene cannot be
+    simulated.
     """
     one_of("method", method, tuple(METHODS))
     one_of("over", over, tuple(_ORDERS))

@@ -1,4 +1,4 @@
-"""Tuning of gains within limits, by SciPy's sequential quadratic programming."""
+"""Tuning of gains within limits on the response."""
 
 from collections.abc import Callable, Iterator
 
@@ -72,17 +72,17 @@ _LEAST, _MOST, _TURN = 1000, 2**20, 0.25
 class Limits(Part):
     """Limits on the response to a step, for `tune_within`.
 
-    The step of a joint leads from the start of the motion to where the arm rests at the
-    last set point. An infinite limit (for the margin: 0) limits nothing. Give overshoot
-    and settling time only for joints that step.
+    A joint's step leads from the start of the motion to where the arm rests at the last
+    set point. Infinity, or a margin of 0, limits nothing. Give overshoot and settling
+    time only for joints that step.
 
     **Arguments:** one value per joint or one for all.
 
     - `overshoot`: greatest excess over the step, as a share of it.
     - `settling_time`: time after which the joint stays within 2 % of the step [s].
     - `effort`: greatest effort that the controller demands [N or N m].
-    - `modulus_margin`: least distance of the loop from instability, from 0 to 1, where
-      the step ends; see `analysis.Margins`.
+    - `modulus_margin`: least `analysis.Margins.modulus` of the loop where the step
+      ends, from 0 to 1.
 
     **Raises:** ValueError for malformed arguments.
 
@@ -102,9 +102,8 @@ def excess(
 ) -> Array:
     """Largest excesses of a motion over its limits (m,), negative within them.
 
-    Overshoot and deviation are shares of the step, efforts and margins shares of their
-    limits. Margins, which take a linearisation of the arm, are left out if no joint's
-    is limited. The number of times is a multiple of 13.
+    Those of positions are shares of the step, others of their limits. The number of
+    times must be a multiple of 13.
     """
     ts, rest = solution.ts, rest_of(scene)
     controller, others = controller_and_others(scene)
@@ -133,23 +132,19 @@ def _largest(values: Array, blocks: int) -> Array:
 
 
 def controller_and_others(scene: Scene) -> tuple[PDController, tuple[Element, ...]]:
-    """Returns the controller of a scene and its other forces."""
     controller = controller_of(scene)
     return controller, tuple(e for e in scene.forces if e is not controller)
 
 
 def rest_of(scene: Scene) -> Array:
-    """Returns where the arm rests at the last set point (n,) [m or rad], or NaN."""
+    """Where the arm rests at the last set point (n,) [m or rad], or NaN."""
     reference = controller_of(scene).reference
     last, _ = reference_motion(reference, jnp.asarray(scene.t1), scene.linkage)
     return equilibrium(scene.linkage, last, scene.forces, scene.t1)
 
 
 def step_shares(solution: Solution, rest: Array) -> tuple[Array, Array, Array]:
-    """Returns joints' changes and speeds as shares of their steps (time, joint).
-
-    Also returns which joints have no step (joint,).
-    """
+    """Returns changes and speeds as shares of the step, and which joints have none."""
     height = rest - solution.q[0]
     still = height == 0
     height = jnp.where(still, 1, height)
@@ -158,10 +153,7 @@ def step_shares(solution: Solution, rest: Array) -> tuple[Array, Array, Array]:
 
 
 def sensitivity(A: Array, B: Array, C: Array) -> Array:
-    """Computes 1 / (1 + L) of each joint's loop (frequency, joint).
-
-    The frequencies reach from far below to far above those of the joints alone.
-    """
+    """Computes 1 / (1 + L) of each joint's loop (frequency, joint)."""
     n = B.shape[1]
     joints = jnp.arange(n)
     own = jnp.sqrt(jnp.abs(C[joints, joints] * B[n + joints, joints])) + 1e-3
@@ -176,10 +168,7 @@ def sensitivity(A: Array, B: Array, C: Array) -> Array:
 
 
 def measured(scene: Scene, limits: Limits) -> Iterator[tuple[str, str, float, float]]:
-    """Yields a row of `TunedWithin` per limit, measured as reports measure.
-
-    The motion is sampled as finely as its fastest mode asks for.
-    """
+    """Measures the motion finely; yields a row of `TunedWithin` per limit."""
     controller, others = controller_and_others(scene)
     limits = in_numpy(limits)
     linkage, t1, rest = scene.linkage, float(scene.t1), rest_of(scene)
@@ -208,7 +197,7 @@ def measured(scene: Scene, limits: Limits) -> Iterator[tuple[str, str, float, fl
 
 
 def _samples_of(t1: float, fastest: float) -> int:
-    """Returns how many samples resolve the fastest mode [rad/s] up to `t1`."""
+    """Returns how many samples up to `t1` resolve the fastest mode [rad/s]."""
     count = t1 * fastest / _TURN
     if not count < _MOST:
         raise ValueError(
@@ -219,7 +208,7 @@ def _samples_of(t1: float, fastest: float) -> int:
 
 
 def _lane(z: Array, problem: tuple[Scene, Loss, Limits, bool]) -> Evaluation:
-    """Evaluates a loss and the excess over limits for gains by factors exp(z) (2n,)."""
+    """Evaluates a loss and the excess over limits for log-factors z (2n,)."""
     scene, loss, limits, with_margins = problem
 
     def residuals(scene, solution):
@@ -243,8 +232,8 @@ def _search(
 ) -> tuple[np.ndarray, float, str]:
     """Returns the best log-factors (2n,), their loss, and why the search stopped.
 
-    Its unknowns are the scaled logarithms in their bounds, and the greatest excess
-    over the limits. As this has a price, limits that cannot be met are exceeded least.
+    Its unknowns are the scaled logarithms, and the greatest excess over the limits. As
+    this has a price, limits that cannot be met are exceeded least.
     """
     first, low, high = box.logs()
     free = low < high
@@ -311,14 +300,12 @@ class TunedWithin(Report):
     """A scene tuned within limits, and which limits it meets; prints itself.
 
     - `scene`: the scene with its tuned gains.
-    - `loss`: loss with the tuned gains.
-    - `start`: kp and kd at the start (2, n).
-    - `lower`, `upper`: the bounds of kp and kd (2, n).
-    - `message`: why the search stopped, in words.
-    - `limit`, `joint`, `allowed`, `reached`: a row per limit: its name, the joint's
-      name, and the allowed and the reached value [1, s, N or N m]; NaN if it does
-      not settle. Margins are those of `analysis.margins`.
-    - `met`: whether each limit is met.
+    - `loss`: its loss.
+    - `start`, `lower`, `upper`: kp and kd at the start, and their bounds (2, n).
+    - `message`: why the search stopped.
+    - `limit`, `joint`, `allowed`, `reached`: for each limit, its name, the joint's
+      name, and the allowed and the reached value [1, s, N or N m]. The latter is NaN if
+      the joint does not settle or its loop is unstable.
     """
 
     scene: Scene
@@ -339,7 +326,7 @@ class TunedWithin(Report):
 
     @property
     def met(self) -> Bool[np.ndarray, " limit"]:
-        """Flags of the limits met; margins are lower limits, all others upper."""
+        """Whether each limit is met; margins are lower limits, all others upper."""
         sign = np.where(np.array(self.limit) == _MARGIN, -1, 1)
         return sign * self.reached <= sign * self.allowed
 
@@ -371,28 +358,23 @@ def tune_within(
     max_steps: int = 50,
     report: Callable[[str], object] | None = None,
 ) -> TunedWithin:
-    """Minimises a scene's loss in its gains, within limits on how it responds.
+    """Minimises a scene's loss over its gains, within limits on its response.
 
-    The search is SciPy's sequential quadratic programming (SLSQP). It uses derivatives
-    of the loss, and of the largest excess over each limit in short spans of time and
-    bands of frequency. It sees 1001 times and 200 frequencies. The report is measured
-    as finely as the fastest mode requires: a limit exceeded between these samples
-    counts as not met.
+    SciPy's sequential quadratic programming (SLSQP) sees 1001 times and 200
+    frequencies. The result is measured as finely as its fastest mode requires: a limit
+    exceeded between these samples counts as not met.
 
     **Arguments:**
 
-    - `scene`: for instance a step, with exactly one `PDController`, and otherwise
-      elements without a state of their own.
+    - `scene`: with exactly one `PDController`, and without elements that have a state.
     - `limits`: a `Limits` [s, N or N m].
-    - `loss`, `factor`, `bounds`: as in `tune`.
-    - `max_steps`: greatest number of steps, which take one or a few evaluations each.
-    - `report`: called with a line after each evaluation, for instance `print`.
+    - `loss`, `factor`, `bounds`, `report`: as in `tune`.
+    - `max_steps`: greatest number of steps, of one or a few evaluations each.
 
-    **Returns:** a `TunedWithin`, which reports the limits that are met. If the search
-    finds no gains that meet all, it holds those whose greatest excess is least:
-    positions at any time count as shares of the step, efforts and margins as shares of
-    their limits. The excess is then spread over several limits; other gains may meet
-    more of them.
+    **Returns:** a `TunedWithin`. If the search finds no gains that meet all limits, the
+    result has those whose greatest excess is least. Excesses are shares of the step;
+    those of efforts and margins are shares of their limits. Other gains may meet more
+    limits.
 
     **Raises:** ValueError as `tune`, and if the arm has no equilibrium at the last set
     point.

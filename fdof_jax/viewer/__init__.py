@@ -1,1 +1,1 @@
-"""A window on motions: a page that plays them in a browser, written by `view`."""
+"""A page that plays motions in a browser."""

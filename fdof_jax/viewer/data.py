@@ -42,7 +42,6 @@ def page_data(motions: list[Motion]) -> dict[str, Any]:
 
 
 def geometry(motion: Motion) -> Any:
-    """Returns the `drawing.geometry` of a motion with its forces."""
     rows, solution = slice(motion.rows), motion.solution
     return drawing.geometry(
         motion.linkage, solution.q[rows], solution.ts[rows], motion.forces
@@ -111,7 +110,7 @@ def _series(motion: Motion, arrays: Arrays) -> list[dict[str, Any]]:
 
 
 def _energies(motion: Motion) -> tuple[np.ndarray, np.ndarray]:
-    """Kinetic and potential energy of the arm and of what acts on it (time,) [J]."""
+    """Kinetic and potential energy of arm and elements (time,) [J]."""
     solution, rows = motion.solution, slice(motion.rows)
     # The control of a sampled motion is none of the elements.
     controls = int(solution.acting is not None)
@@ -124,7 +123,7 @@ def _energies(motion: Motion) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _events(motion: Motion) -> list[list[Any]]:
-    """Returns the events as time and words, in the order of time."""
+    """Returns events as time and words, in the order of time."""
     solution, last = motion.solution, motion.solution.ts[motion.rows - 1]
     found = []
     if solution.events is not None:

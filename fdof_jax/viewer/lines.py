@@ -1,9 +1,7 @@
 """The lines of a picture as sums over the links' frames, so that rows stay small.
 
-A line (time, corner) of points x + iy [m] that is fixed to links is a sum of columns
-(time) times coefficients (corner). The columns are, in this order: the directions of
-links 0 to n, the starts of links 1 to n, and further ones for what moves in another
-way, such as a spring's width or an arrow's length.
+The columns (time) are directions and starts of links, and further ones; a line (time,
+corner) is their sum with coefficients (corner).
 """
 
 from typing import NamedTuple
@@ -23,8 +21,7 @@ def lines_of(
 ) -> tuple[list[Line], list[np.ndarray]]:
     """Returns the lines of parts, and the further columns.
 
-    `angle`: of links 0 to n (time, n + 1) [rad]; `parts`: points (time, corner) by
-    name; `small`: what nobody sees [m].
+    `angle`: of links 0 to n (time, n + 1) [rad]; `small`: what nobody sees [m].
     """
     starts = [parts[f"link {k}"][:, 0] for k in range(1, angle.shape[1])]
     frames = np.column_stack([np.exp(1j * angle), *starts])

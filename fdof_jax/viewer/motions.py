@@ -1,4 +1,4 @@
-"""The motions of a page: one, several by title, or the members of a batch."""
+"""The motions of a page: one, several by title, or those of a batch."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -27,7 +27,7 @@ def motions_of(linkage: Any, solution: Any, forces: Any) -> list[Motion]:
     if not isinstance(solution, Mapping):
         for name in "linkage", "forces":
             if isinstance(given[name], Mapping):
-                expected = "no dictionary, as the solution is none"
+                expected = "no dictionary beside a single solution"
                 raise refusal(name, expected, given[name])
         return _members("", given, "")
     if isinstance(linkage, Scene):  # whose forces need not be those of all solutions
@@ -52,7 +52,7 @@ def motions_of(linkage: Any, solution: Any, forces: Any) -> list[Motion]:
 
 
 def _members(title: str, given: dict[str, Any], place: str) -> list[Motion]:
-    """Returns a motion, or those of a batch; `place`: of the title, for messages."""
+    """Returns a motion, or those of a batch; `place` is for messages."""
     scene, forces = given["linkage"], given["forces"]
     if isinstance(scene, Scene):
         if forces is not None:
@@ -92,6 +92,6 @@ def _members(title: str, given: dict[str, Any], place: str) -> list[Motion]:
 
 
 def _at(index: tuple[int, ...], batch: tuple[int, ...], tree: Any) -> Any:
-    """Returns a member; what has no axes of the batch is the same for all."""
+    """Returns a member; what has no batch axes is common to all."""
     has = lambda leaf: batch and np.shape(leaf)[: len(batch)] == batch
     return jax.tree.map(lambda leaf: leaf[index] if has(leaf) else leaf, tree)

@@ -1,4 +1,4 @@
-"""A still picture of a motion, as SVG: what the page shows where scripts are off."""
+"""A still picture of a motion, as SVG, for pages without scripts."""
 
 from html import escape
 
@@ -12,7 +12,7 @@ _MOST = 400  # points of the tip's path
 
 
 def still_picture(motion: Motion) -> str:
-    """Returns the arm at three times, from faint to full, and the path of its tip."""
+    """Returns the arm at three times, from faint to full, and its tip's path."""
     g = geometry(motion)
     left, low, right, high = box_of(g.points)
     size = max(right - left, high - low, 1e-9)

@@ -19,10 +19,7 @@ _MOST_NAMED = 5  # motions in the title of the page
 
 @dataclass(frozen=True)
 class View:
-    """A page that plays motions: its file's `path`, and its text, `html`.
-
-    A notebook shows the page itself.
-    """
+    """A page that plays motions: its file's `path`, and its text, `html`."""
 
     path: Path
     html: str = field(repr=False)
@@ -40,30 +37,26 @@ def view(
     forces: tuple[Any, ...] | Mapping[str, tuple[Any, ...]] | None = None,
     path: str | os.PathLike[str] = "motion.html",
 ) -> View:
-    """Writes a page that plays a motion in any browser, and curves over time beside it.
+    """Writes a page that plays a motion in any browser, beside its curves over time.
 
-    The page is one file, which needs no network: it can be sent by mail. It draws the
-    arm and what acts on it as `drawing.draw_linkage` does, the path of the tip, the
-    curves of positions [rad, m], velocities, efforts [N m, N] and energies [J], and
-    marks events and what holds joints. Efforts and energies are computed with the
-    forces given, as `joint_efforts` and `energy` do: give those of the simulation.
-    Between two rows positions are interpolated linearly. Numbers have 32 bits.
+    The page is one file, which needs no network. It draws the arm and what acts on it
+    as `drawing.draw_linkage` does, plots positions [rad, m], velocities, efforts and
+    energies [J], and marks events and held joints. It interpolates positions linearly.
+    Numbers have 32 bits.
 
     **Arguments:**
 
-    - `solution`: that of one `simulate` or `simulate_sampled`, whose forces are
+    - `solution`: that of one `simulate`, or of one `simulate_sampled`, whose forces are
       `(control, *forces)`; of a failed one, the rows reached are shown. A batch shows
-      all members, one in full, the others as ghosts. A dictionary, title -> solution,
-      compares motions, laid over each other or side by side.
-    - `linkage`, `forces`: those of the solution. With a dictionary of solutions, each
-      may be a dictionary of the same titles; else they are the same for all. A batch of
-      arms belongs to a batch of motions; all its members are drawn with one set of
-      forces, without a batch axis. A `Scene` stands for a linkage and its forces, which
-      are then left out; beside a dictionary of solutions, Scenes are in a dictionary.
+      one member in full, the others as ghosts. A dictionary, title -> solution,
+      compares motions.
+    - `linkage`, `forces`: those of the simulation, or a `Scene` in place of both. With
+      a dictionary of solutions, each may be a dictionary of the same titles; Scenes
+      must be in one. A batch of arms needs a batch of motions; its members share their
+      forces.
     - `path`: of the file, which is replaced.
 
-    **Returns:** a `View`, with the file's `path`; as the last line of a notebook's cell
-    it shows the page.
+    **Returns:** a `View`; last in a notebook's cell, it shows the page.
 
     **Raises:** ValueError for malformed arguments and a file that cannot be written.
 
