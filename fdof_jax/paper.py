@@ -1,8 +1,7 @@
 """The paper's six equations in its chain coordinates, masked by existence factors.
 
-x = (B1, th2, B2, th3, B3, th4) with absolute angles. The code follows equations
-(8)-(27), with misprints corrected where marked. `dynamics` holds the reduced form that
-simulations use.
+x = (B1, th2, B2, th3, B3, th4) with absolute angles. Misprints are corrected where
+marked. `dynamics` holds the reduced form that simulations use.
 """
 
 import jax.numpy as jnp
@@ -69,9 +68,8 @@ def from_chain(
 
     **Returns:** `locked` for `Linkage`, and the `State`.
 
-    **Raises:** ValueError for malformed input and for velocities that would move a
-    fictitious joint. The paper's method stops only accelerations, so the joint would
-    drift.
+    **Raises:** ValueError for malformed input, and for velocities that would move a
+    fictitious joint.
 
     >>> import fdof_jax as fj
     >>> locked, state = fj.paper.from_chain("RPR", [0, 1.5, 2.5, 2.5, 0, 2], [0] * 6)
@@ -108,7 +106,7 @@ def from_chain(
 def _joints_of_chain(
     ef: Array, x: Array, xd: Array, base_angle: Array
 ) -> tuple[Array, Array, State]:
-    """Returns positions and rates of the fictitious joints, and those of the real."""
+    """Returns positions and rates of the fictitious joints, and of the real ones."""
     revolute = jnp.stack(real_joints(ef))
     slide, turn = x[0::2], jnp.diff(x[1::2], prepend=base_angle)
     slide_rate, turn_rate = xd[0::2], jnp.diff(xd[1::2], prepend=0)
@@ -299,14 +297,14 @@ def masked_accelerations(
     """Computes the six accelerations by the EF-masked rows (17)-(27).
 
     The row of a real joint is its row of (15) plus the rows of the fictitious revolute
-    joints beyond it. The row of a fictitious joint keeps it still: Bdd = 0, or the same
-    angular acceleration as the link before. The paper multiplies these rows by a mass,
-    which may vanish; here the coefficient is 1. (The minus sign before B3dd M(5,5) in
-    (19) is wrong wherever the last joint is prismatic.)
+    joints beyond it. The row of a fictitious joint keeps it still: Bdd = 0, or the
+    angular acceleration of the link before. The paper multiplies these rows by a mass,
+    which may vanish; here the factor is 1. (In (19), the minus sign before B3dd M(5,5)
+    is wrong where the last joint is prismatic.)
 
-    **Arguments:** `x`, `xd`: chain coordinates and rates [m, rad, m/s, rad/s];
-    `force`: joint efforts (F_B1, tau_th2, ..., tau_th4) [N, N m], each revolute one
-    reacting on the preceding link. Those of fictitious joints have no effect.
+    **Arguments:** `x`, `xd`: chain coordinates and rates [m, rad, m/s, rad/s]; `force`:
+    joint efforts (F_B1, tau_th2, ..., tau_th4) [N, N m], each revolute one reacting on
+    the preceding link. Those of fictitious joints have no effect.
 
     **Returns:** `xdd` [m/s^2, rad/s^2].
 
@@ -357,9 +355,8 @@ def constraint_forces(
 ) -> Float[Array, " chain"]:
     """Computes the generalised constraint forces at fictitious joints, (16)-(26).
 
-    This force, added to a fictitious joint's command in `force`, keeps the joint still.
-    The balance (15) gives it from the accelerations, from the tip inwards. The result
-    equals the printed forms ((24) prints an equals sign for a plus).
+    Added to a fictitious joint's command in `force`, this force keeps the joint still.
+    It equals the printed forms ((24) prints an equals sign for a plus).
 
     **Arguments:** as for `masked_accelerations`.
 

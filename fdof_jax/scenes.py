@@ -99,7 +99,7 @@ def fig7() -> Scene:
 def double_pendulum() -> Scene:
     """A conservative double pendulum of two rods of 1 kg and 1 m, released raised.
 
-    It moves for 10 s in a vertical plane, from 0.5 rad above the horizontal [rad].
+    It starts 0.5 [rad] above the horizontal and moves in a vertical plane for 10 s.
 
     >>> import fdof_jax as fj
     >>> fj.scenes.double_pendulum().linkage.mass.tolist()  # [kg]
@@ -118,8 +118,8 @@ def double_pendulum() -> Scene:
 def cart_pole() -> Scene:
     """A pole that hangs from a cart on a horizontal rail, 0.2 rad from equilibrium.
 
-    The ground's frame points down: the cart slides along x [m], and at an angle of 0
-    the pole hangs [rad].
+    The ground's frame points down: the cart slides along x [m], and the pole hangs at
+    an angle of 0 [rad].
 
     >>> import fdof_jax as fj
     >>> arm, start, *_ = fj.scenes.cart_pole()
@@ -163,7 +163,7 @@ def two_link_circle() -> Scene:
 
 
 def five_links() -> Scene:
-    """A conservative chain of five rods of 1 kg and 0.5 m [m], bent and at rest.
+    """A conservative chain of five rods of 1 kg and 0.5 [m], bent and at rest.
 
     >>> import fdof_jax as fj
     >>> fj.scenes.five_links().linkage.mass.shape
@@ -182,11 +182,11 @@ def five_links() -> Scene:
 def circle_scenes() -> dict[str, Scene]:
     """The same circle for an arm of each topology, under PD control and gravity.
 
-    All arms have links of 1 m, 0.8 m and 0.5 m with masses of 2 kg, 1.5 kg and 1 kg.
-    They start at rest in the same configuration, with their tip 5 cm inside the circle
-    of 0.25 m radius, and keep the angle of their last link. Only the choice of the real
-    joint of each pair differs. All joints of a kind have the same gains and limits
-    (150 N m or N).
+    Only the real joint of each pair differs. All arms have links of 1 m, 0.8 m and 0.5
+    m with masses of 2 kg, 1.5 kg and 1 kg. They start at rest in the same
+    configuration, with the tip 5 cm inside the circle of 0.25 m radius, and keep the
+    angle of the last link. Joints of a kind have the same gains and limits (150 N m or
+    N).
 
     >>> import fdof_jax as fj
     >>> scenes = fj.scenes.circle_scenes()

@@ -23,8 +23,6 @@ _RANKS = dict(
 
 
 class Batch(NamedTuple):
-    """Linkage, state and forces of all members."""
-
     moving: PyTree  # their arrays with a batch axis, and None for other leaves
     shared: PyTree  # their other leaves, and None for these
     size: int

@@ -57,8 +57,6 @@ _STEPS, _ANGLE = 16, 0.3  # of the rough motion in a forecast: number and size
 
 
 class Common(NamedTuple):
-    """The arguments that all members of a sweep have in common."""
-
     shared: PyTree  # of a `Batch`
     ts: Array | np.ndarray
     settings: Settings
@@ -66,8 +64,6 @@ class Common(NamedTuple):
 
 
 class Job(NamedTuple):
-    """The members that a sweep solves, its devices, and the size of its chunks."""
-
     moving: PyTree  # of a `Batch`
     common: Common
     size: int
@@ -76,8 +72,6 @@ class Job(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """The outcome of a member, or of several with a leading axis."""
-
     value: PyTree  # what the reduction returns
     stopped: Array  # because most lanes were long done
     failed: Array
@@ -96,7 +90,7 @@ def _check_value(value: PyTree) -> None:
 def outcome_of(common: Common, moving: PyTree, abreast: bool = False) -> Outcome:
     """Computes the outcome of one member.
 
-    If `abreast`, a member is stopped when most lanes are long done.
+    If `abreast`, it stops when most lanes are long done.
     """
     linkage, state0, forces = eqx.combine(moving, common.shared)
     settings = common.settings
@@ -134,7 +128,6 @@ class Form(NamedTuple):
     leaves: tuple[Any, ...]  # of `common`: kinds of arrays, and constants
 
     def values(self, lanes: list[Array], arrays: list[Array]) -> PyTree:
-        """Computes the function's values for all lanes of a chunk."""
         given = iter(arrays)
         value = lambda x: known_array(x) if isinstance(x, tuple) else x
         leaves = [next(given) if _is_kind(x) else value(x) for x in self.leaves]
@@ -155,14 +148,14 @@ def _is_kind(leaf: object) -> bool:
 def _form_of(
     function: Callable, job: Job, lanes: int
 ) -> tuple[Form, list[Array], list[Array]]:
-    """Returns the form of the program for so many lanes; members' and common arrays."""
+    """Returns the form of the program for so many lanes, and its arrays."""
 
     def kind(array: Array, shape: tuple[int, ...]) -> jax.ShapeDtypeStruct:
         dtype = jax.dtypes.canonicalize_dtype(array.dtype, allow_extended_dtype=True)
         return _kind(shape, dtype, getattr(array, "weak_type", False))
 
     def cast(arrays: list[Array], kinds: Sequence[jax.ShapeDtypeStruct]) -> list[Array]:
-        """Returns arrays in the types that the program takes: its call casts none."""
+        """Casts arrays to the program's types, which its call does not."""
         pairs = zip(in_numpy(arrays), kinds)
         return [a if a.dtype == k.dtype else a.astype(k.dtype) for a, k in pairs]
 
@@ -191,7 +184,7 @@ def _jitted(form: Form) -> jax.stages.Wrapped:
 
 @functools.lru_cache(maxsize=64)
 def _lowered(form: Form, device: Device) -> jax.stages.Lowered:
-    """Traces the program of this form for a device, or for the default one (None)."""
+    """Traces the program of this form for a device."""
     arguments = list(form.lanes), list(filter(_is_kind, form.leaves))
     if device is not None:
         there = SingleDeviceSharding(device)
@@ -200,7 +193,6 @@ def _lowered(form: Form, device: Device) -> jax.stages.Lowered:
 
 
 def _programs(form: Form, devices: list[Device]) -> list[jax.stages.Compiled]:
-    """Returns the program of this form for each of the devices."""
     if len(devices) > 1 and devices[0].client is devices[1].client:
         # Tracing depends on settings of this thread.
         programs = [_lowered(form, device) for device in devices]
@@ -215,7 +207,7 @@ def _programs(form: Form, devices: list[Device]) -> list[jax.stages.Compiled]:
 def _in_lanes(
     function: Callable, job: Job, devices: list[Device], members: np.ndarray, lanes: int
 ) -> Iterator[tuple[np.ndarray, PyTree]]:
-    """Yields members of a batch in chunks, as they are done, and their values."""
+    """Yields chunks of members, as they are done, and their values."""
     chunks = [members[i : i + lanes] for i in range(0, len(members), lanes)]
     devices = devices[: len(chunks)]
     form, leaves, arrays = _form_of(function, job, lanes)
@@ -253,9 +245,9 @@ def _in_lanes(
 def expected_work(common: Common, moving: PyTree) -> Array:
     """Computes for each member a number that grows with its steps.
 
-    It combines the joints' rates and accelerations, averaged over the beginning of the
-    motion, which rough steps approximate [1/s]. Where elements hold joints it is the
-    energy [J], because most steps then end at events, each of which takes some of it.
+    It averages the joints' rates and accelerations over a rough beginning of the motion
+    [1/s]. Where elements hold joints it is the energy [J], of which each event takes
+    some.
     """
     ts = common.ts
 
@@ -295,7 +287,7 @@ def expected_work(common: Common, moving: PyTree) -> Array:
 
 
 def _forecast(job: Job, devices: list[Device]) -> np.ndarray:
-    """Returns the `expected_work` of all members; one program serves any number."""
+    """Returns the `expected_work` of all members, by one program for any number."""
     common = job.common._replace(settings={}, reduce=None)  # which make no difference
     works = np.empty(job.size)
     everyone, job = np.arange(job.size), job._replace(common=common)
@@ -308,14 +300,13 @@ def _forecast(job: Job, devices: list[Device]) -> np.ndarray:
 
 
 def _lanes(members: int, chunk: int) -> int:
-    """Returns the number of lanes for some members, one of a few for all batches."""
+    """Returns the number of lanes for some members, one of few for all batches."""
     if members == 1:
         return 1
     return min(chunk, max(_SMALL, 1 << (members - 1).bit_length()))
 
 
 def _outcomes(common: Common, moving: PyTree) -> Outcome:
-    """Computes the outcomes of all lanes of a chunk."""
     abreast = jax.tree.leaves(moving)[0].shape[0] > _ALL_ALIKE
     member = lambda moving: outcome_of(common, moving, abreast)
     return jax.vmap(member, axis_name=_AXIS)(moving)
@@ -324,7 +315,7 @@ def _outcomes(common: Common, moving: PyTree) -> Outcome:
 def in_chunks(
     job: Job, meter: diffrax.AbstractProgressMeter | None = None, on_device: bool = True
 ) -> Outcome:
-    """Returns the outcomes of all members; unless `on_device`, in NumPy's arrays."""
+    """Returns the outcomes of all members, in NumPy's arrays unless `on_device`."""
     size, devices = job.size, job.devices
     lanes = _lanes(-(-size // len(devices)), job.chunk)
     if size > _ALL_ALIKE:  # XLA splits no operation of fewer lanes among cores

@@ -1,9 +1,7 @@
 """The devices that solve the chunks of a batch, and their programs.
 
-XLA on CPU splits each operation of a program among threads for all cores. For a chunk
-this gains nothing, because the threads wait for each other and for whatever else runs
-(`python -m benchmarks --only cores`). So each core has a client of XLA of its own here,
-with a single thread.
+On CPU, XLA's threads wait for each other, so a chunk gains nothing by several. Here
+each core has a client of XLA with a single thread.
 """
 
 import contextlib
@@ -36,7 +34,7 @@ _THREADS = "NPROC"  # of a client of XLA, which reads it when it starts
 
 
 def cores() -> int:
-    """Returns the number of cores that this process may use."""
+    """Returns the number of cores for this process."""
     if sys.platform == "linux":
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -66,8 +64,8 @@ def of_cores(devices: list[Device]) -> list[Device]:
 def devices_outside_mesh() -> Iterator[list[Device]]:
     """Yields the devices of the mesh that is set, else all of this process.
 
-    They are [None], the default device, if there is only one. Meanwhile no mesh is set:
-    its devices would share each program. Before 0.8.1 JAX does not say which is set.
+    They are [None], the default device, if there is only one. Meanwhile no mesh is set,
+    whose devices would share each program.
     """
     set_mesh = jax.__version_info__ >= (0, 8, 1)
     mesh = jax.sharding.get_mesh() if set_mesh else _NO_MESH
@@ -85,8 +83,7 @@ def compiled(program: jax.stages.Lowered) -> jax.stages.Compiled:
 def copied(program: jax.stages.Compiled, device: Device) -> jax.stages.Compiled | None:
     """Returns a program for another CPU device, uncompiled; None if that cannot be.
 
-    Copies of programs that JAX took from a folder lack parts; but then the folder has
-    one for the other device, too. Programs that call Python cannot be copied.
+    Programs that call Python cannot be copied. Those from JAX's cache lack parts.
     """
     if jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
         return None
@@ -109,23 +106,17 @@ def thread_of(device: Device) -> ThreadPoolExecutor:
 
 
 def in_place(arrays: PyTree, device: Device) -> PyTree:
-    """Puts arrays on a device, except NumPy's, which a program's call transfers faster.
-
-    Other transfers depend on settings of this thread.
-    """
+    """Puts arrays on a device, except NumPy's, which a call transfers faster."""
     put = lambda a: a if isinstance(a, np.ndarray) else jax.device_put(a, device)
     return jax.tree.map(put, arrays)
 
 
 def solve(program: jax.stages.Compiled, *arguments: PyTree) -> PyTree:
-    """Returns what a program computes, from arrays that its call transfers."""
+    """Calls a program and waits for its results."""
     return jax.block_until_ready(program(*arguments))
 
 
 def in_thread(function: Callable[..., PyTree], *arguments: PyTree) -> PyTree:
-    """Calls a function in a thread, which may not know of the caller's settings.
-
-    Among these is the precision that a program was traced with.
-    """
+    """Calls a function in a thread, which may not know of the caller's precision."""
     with enable_x64(True), jax.transfer_guard("allow"):
         return function(*arguments)

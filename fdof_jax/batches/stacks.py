@@ -1,4 +1,4 @@
-"""Scenes of one structure as one scene, with a leading axis on every array."""
+"""Scenes of one structure as one scene."""
 
 from collections.abc import Sequence
 from typing import TypeVar
@@ -17,10 +17,7 @@ _Stacked = TypeVar("_Stacked")
 
 
 def _is_number(leaf: object) -> bool:
-    """Returns whether a leaf of a scene is data: an array or a float.
-
-    Python's integers and booleans, such as an element's index, are not data.
-    """
+    """Returns whether a leaf of a scene is data: an array or a float."""
     return eqx.is_array_like(leaf) and not isinstance(leaf, bool | int)
 
 
@@ -61,7 +58,6 @@ def stacked(scenes: Sequence[_Stacked], name: str = "scenes") -> _Stacked:
 
 
 def unstacked(name: str, scenes: Scene) -> list[Scene]:
-    """Splits stacked scenes into their members."""
     instance(name, scenes, Scene)
     arrays, rest = eqx.partition(scenes, _is_number)
     leaves, structure = jax.tree.flatten(arrays)

@@ -1,8 +1,7 @@
 """Keeps the results of a sweep in a folder, a Zarr group, block by block of members.
 
-zarr-python writes each file under another name and then renames it, so that a process
-that is killed leaves no file in part; a checksum ends each file of numbers, and a
-digest per block tells its members from those of others.
+A killed process leaves no file in part. Each file of numbers has a checksum, and each
+block a digest of its members.
 """
 
 import hashlib
@@ -65,7 +64,7 @@ def _is_result(leaf: object) -> bool:
 
 
 def _named(value: PyTree) -> dict[str, PyTree]:
-    """Returns the arrays of a member's value by names made of their places."""
+    """Returns the arrays of a member's value, named by their places."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(value, is_leaf=_is_result)
     named, taken = {}, {"failed"}
     for path, leaf in leaves:
@@ -82,7 +81,6 @@ def _named(value: PyTree) -> dict[str, PyTree]:
 
 
 def _variables(like: PyTree, linkage: Linkage) -> list[Variable]:
-    """Returns the variables of a store from the shapes of a member's value."""
     of_motion = isinstance(like, Solution)
     labels = attributes_in(common_unit(names_and_units(linkage.ef)[1]))
     variables = []
@@ -106,8 +104,7 @@ def _variables(like: PyTree, linkage: Linkage) -> list[Variable]:
 class Store:
     """A folder that is a Zarr group, whose chunks along members are blocks.
 
-    No two blocks share a file. The file of `failed` ends a block: it comes last, after
-    the block's digest.
+    No two blocks share a file. The file of `failed` ends a block, after its digest.
     """
 
     def __init__(self, folder: Path, job: Job, like: PyTree, sweep: str):
@@ -147,7 +144,7 @@ class Store:
         self, zarr: ModuleType, attributes: dict, linkage: Linkage,
         ts: Array | np.ndarray, like: PyTree,
     ) -> dict[str, bytes]:  # fmt: skip
-        """Returns the files of the group without any member, the group's own first."""
+        """Returns the files of the group without members, its own first."""
         memory = {}
         group = zarr.create_group(zarr.storage.MemoryStore(memory))
 
@@ -215,7 +212,7 @@ class Store:
     def failed(self, block: int) -> np.ndarray | None:
         """Returns which members of a finished block failed, or None if it is to solve.
 
-        Damaged files are reported by a warning.
+        Warns of damaged files.
         """
         if not self._holds(f"failed/c/{block}"):
             return None
@@ -278,7 +275,7 @@ class Store:
 def in_store(
     store: Store, blocks: range, job: Job, meter: diffrax.AbstractProgressMeter
 ) -> list[int]:
-    """Solves blocks of members that the store lacks; returns the failed members."""
+    """Solves the blocks that the store lacks; returns the failed members."""
     failures, progress = [], meter.init()
     for done, block in enumerate(blocks, 1):
         failed = store.failed(block)
@@ -296,7 +293,7 @@ def in_store(
 
 
 def _constants(program: ClosedJaxpr | Jaxpr) -> Iterator[Array]:
-    """Yields the arrays that a program holds, and the programs within it.
+    """Yields the arrays in a program, and in the programs within it.
 
     Raises ValueError if it calls a Python function, which no digest can name.
     """
@@ -317,8 +314,7 @@ def _constants(program: ClosedJaxpr | Jaxpr) -> Iterator[Array]:
 def outline(moving: PyTree, common: Common) -> tuple[PyTree, str]:
     """Returns shapes and types of a member's value, and the digest of the sweep.
 
-    The digest is of the program and of all arrays, and the same in every process. The
-    program names functions, such as force elements, by what they compute. Raises
+    It covers the program and all arrays, and is the same in every process. Raises
     ValueError for callbacks into Python.
     """
     value = lambda *member: jax.tree.map(jnp.asarray, outcome_of(*member).value)

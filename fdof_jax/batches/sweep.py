@@ -1,9 +1,7 @@
 """Many motions at once: as `jax.vmap(simulate)`, but faster and in less memory.
 
-A vectorised adaptive solve runs until its slowest member is done. `sweep` orders the
-members by expected work and cuts them into chunks of one shape. A member that takes
-many more steps than its neighbours is stopped and solved again later, in a smaller
-batch of slow members.
+Members come in chunks of similar work, so that few wait for a slower one. Very slow
+ones are stopped and solved again together.
 """
 
 import contextlib
@@ -55,7 +53,6 @@ _CHUNK_HELD = 64
 
 
 def _without_times(_: Scene, solution: Solution) -> Solution:
-    """Leaves out the output times, which all members have in common."""
     return eqx.tree_at(lambda s: s.ts, solution, None)
 
 
@@ -162,44 +159,44 @@ def sweep(
 ) -> Any:
     """Computes many motions, as `jax.vmap(simulate)` does, but faster.
 
-    A member that fails ends early with its own result, and a slow member delays few
+    A member that fails ends early with its own result, and a slow one delays few
     others. `sweep` runs on all devices of this process.
 
     **Arguments:**
 
     - `linkage`, `state0`: as in `simulate`, any of their arrays with a leading batch
-      axis; arrays without it are shared by all members. A `Scene` may stand for
-      linkage, state0 and forces: `sweep(scene, ts)`.
-    - `ts`: increasing output times, common to all members, of shape (time,) [s].
+      axis; all members share the others. A `Scene` may stand for linkage, state0 and
+      forces: `sweep(scene, ts)`.
+    - `ts`: increasing output times of all members, of shape (time,) [s].
     - `forces`: force elements; `forces_axes`: which of their arrays carry the batch
       axis, as `in_axes` of `jax.vmap`: 0 for all, None (the default) for none, or a
-      tuple of these with one entry per element.
-    - `reduce`: a function of one member's `Scene` and `Solution`, for example
-      `lambda scene, motion: motion.q[-1]`, or a loss of `tune`. Of each member, only
-      the arrays that it returns are kept. Functions of equal code share a compiled
-      program.
-    - `chunk`: largest number of members to solve together, per device; None stands for
-      256, or 64 where elements hold joints.
+      tuple with an entry per element.
+    - `reduce`: a function of one member's `Scene` and `Solution`, such as
+      `lambda scene, motion: motion.q[-1]`. Only the arrays that it returns are kept.
+      Functions of equal code share a program.
+    - `chunk`: largest number of members to solve together, per device; by default 256,
+      or 64 where elements hold joints.
     - `throw`: whether to raise an error if any member fails.
-    - `store`: a folder for the results, which are then not held in memory. It is a Zarr
-      group for `xarray.open_zarr`, written in blocks of members (`fdof_jax[data]`
-      installs zarr). A repeated call solves only missing or damaged blocks; a warning
-      names damaged files. A folder that holds another sweep, or anything else, is
-      rejected.
-    - `shard`, `of`: with `store`, solves only each block whose number is `shard` modulo
-      `of`. Any number of processes may fill one store, in any order.
+    - `store`: a folder for the results, which are then not held in memory: a Zarr group
+      for `xarray.open_zarr`, in blocks of members (`fdof_jax[data]` installs zarr). A
+      repeated call solves only missing or damaged blocks. A folder that holds anything
+      else is rejected.
+    - `shard`, `of`: with `store`, solves only blocks whose number is `shard` modulo
+      `of`. Any number of processes may fill one store.
     - `solver`, `rtol`, `atol`, `max_step`, `stepsize_controller`, `dt0`, `adjoint`,
       `max_steps`, `progress_meter`: as in `simulate`.
 
     **Returns:** a `Solution` with a leading batch axis everywhere; `result` reports how
-    each member ended. With `reduce`, the arrays that it returns, with a leading batch
-    axis: NaN, or a `motion.result` among them, marks failed members. With `store`, its
-    path. Under `jax.grad` or another transformation a failed member adds nothing to any
-    derivative, and `solution.result == diffrax.RESULTS.successful` selects the members
-    that count. Finding these members takes one more solve, without derivatives.
+    each member ended. With `reduce`, its arrays with that axis: NaN, or a
+    `motion.result` among them, marks failed members. With `store`, its path.
+
+    Under `jax.grad` or another transformation a failed member adds nothing to any
+    derivative; `solution.result == diffrax.RESULTS.successful` selects the others.
+    Finding them takes one more solve.
 
     **Raises:** ValueError for malformed arguments; RuntimeError, with `throw=True`, if
-    a member fails; ImportError, with `store`, where zarr is not installed.
+    a member fails; ImportError, with `store`, where zarr is not installed. Warns of
+    damaged files.
     """
     # Arrays may be on any devices; chunks of them go to those of the sweep.
     linkage, state0, forces = in_numpy((linkage, state0, forces))

@@ -1,8 +1,4 @@
-"""Servo drives, which turn a controller's command into a joint's effort.
-
-A command is a force element, such as a `PDController` or another drive. It returns
-efforts, or voltages for a motor.
-"""
+"""PID control, and servo drives, which turn a command into a joint's effort."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -26,13 +22,13 @@ class PIDController(StatefulElement):
     """Saturated PID control of the joints, with anti-windup: a force element.
 
     The effort is that of a `PDController` plus ki times the integral of the position
-    error, clipped to +-limit as a whole. Anti-windup is by back-calculation: the
-    clipped part of the effort drains the integral with the time constant kp / ki.
+    error, clipped to +-limit as a whole. The clipped part drains the integral with the
+    time constant kp / ki (back-calculation).
 
     **Arguments:** one value per joint or one for all.
 
     - `kp`, `kd`, `limit`, `reference`: as in `PDController`, which is the field `pd`.
-    - `ki`: gains of the integral, not negative; 0 where kp is [N/(m s) or N m/(rad s)].
+    - `ki`: integral gains, not negative; 0 where kp is [N/(m s) or N m/(rad s)].
 
     **Raises:** ValueError for malformed arguments.
 
@@ -81,7 +77,7 @@ class PIDController(StatefulElement):
 
 
 class DriveState(NamedTuple):
-    """State of a drive: its `own` and its `command`'s state, () where there is none."""
+    """State of a drive: its `own` and its `command`'s state, () without one."""
 
     own: PyTree
     command: PyTree
@@ -92,7 +88,7 @@ class Drive(StatefulElement):
 
     A subclass implements `respond`, and `initial` if it has a state.
 
-    - `command`: a force element, whose effort is the command [N or N m].
+    - `command`: a force element whose effort is the command [N or N m].
 
     >>> import fdof_jax as fj
     >>> class Halved(fj.control.Drive):
@@ -131,10 +127,9 @@ class Drive(StatefulElement):
 
 
 def controller_in(element: object) -> PDController | None:
-    """Returns the controller that an element is, or holds as its command, if any.
+    """Returns the controller that an element is, or holds as its command, or None.
 
-    Of a `PIDController` that is its PD part, which has the reference and the limits
-    [N or N m].
+    For a `PIDController`, this is its PD part, with the limits [N or N m].
     """
     while isinstance(element, Drive):
         element = element.command
@@ -149,7 +144,7 @@ class FirstOrderLag(Drive):
     The rate of the effort is (command - effort) / time_constant.
 
     **Arguments:** `command`: a force element; `time_constant`: one per joint or one for
-    all, positive [s]; `start`: initial effort [N or N m].
+    all, positive [s]; `start`: initial effort, by default 0 [N or N m].
 
     **Raises:** ValueError for malformed arguments.
 
@@ -175,15 +170,13 @@ class SpeedLimit(Drive):
     """A drive whose effort limit falls with speed: a straight torque-speed curve.
 
     In the direction of motion the effort is at most stall * (1 - |qd| / no_load), not
-    below 0. Against the motion it is at most stall, at any speed.
+    below 0. Against the motion it is at most stall.
 
-    Data sheets of servo drives show this curve: their amplifiers limit the current to
-    that of stall. A motor with a voltage limit alone brakes with more than stall,
-    because its back-EMF adds to the voltage, and is braked above the no-load speed. Use
-    a `DCMotor` where that matters.
+    Servo amplifiers with a current limit have this curve. Where only the voltage is
+    limited, use a `DCMotor`.
 
-    **Arguments:** `command`: a force element; `stall` [N or N m] and `no_load` [m/s or
-    rad/s]: one per joint or one for all, positive.
+    **Arguments:** `command`: a force element; `stall` [N or N m] and `no_load`
+    [m/s or rad/s]: one per joint or one for all, positive.
 
     **Raises:** ValueError for malformed arguments.
 
@@ -209,22 +202,20 @@ class DCMotor(Drive):
     """Brushed motors on geared joints: winding, back-EMF, limited voltage and current.
 
     The current i obeys inductance * di/dt = v - resistance * i - constant * gear * qd,
-    and the effort is constant * gear * i. The command returns the voltages v, which are
-    clipped such that the current stays within its limit, then to +-voltage_limit. At
-    speeds whose back-EMF exceeds the voltage limit, the back-EMF drives the current.
-    The inertia of the rotors is a separate `Rotor` or `Armature`.
+    and the effort is constant * gear * i. The command's voltages v are clipped such
+    that the current stays within its limit, then to +-voltage_limit. Back-EMF beyond
+    the voltage limit drives the current. The rotor's inertia is a separate `Rotor` or
+    `Armature`.
 
     Without inductance the current is (v - constant * gear * qd) / resistance at once,
     and the motor has no state. Leave the inductance out where inductance / resistance,
-    often about a millisecond, is short beside the motion: explicit steps are otherwise
-    as short.
+    often a millisecond, is short beside the motion: explicit steps would be as short.
 
     **Arguments:** one value per joint or one for all, positive.
 
-    - `command`: a force element, whose efforts are the voltages [V].
-    - `resistance`: resistance of the winding [ohm].
-    - `inductance`: inductance of the winding, in all joints or in none [H]. Zeros are
-      stored as None; a traced inductance must be positive.
+    - `command`: a force element whose efforts are the voltages [V].
+    - `resistance`, `inductance`: those of the winding [ohm, H]. The inductance is 0 in
+      all joints (the default, stored as None) or in none; a traced one is positive.
     - `constant`: torque and back-EMF constant [N m/A = V s/rad; N/A of a linear motor].
     - `gear`: angle of the motor per angle of the joint [1] or per metre of a slide
       [rad/m].

@@ -1,4 +1,4 @@
-"""PD control of the joints as in Fig 7, also with a model of the arm, and its gains."""
+"""PD control of the joints, also with a model of the arm, and its gains."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -27,17 +27,16 @@ class PDController(ScalarElement):
 
     The effort is kp * (q_ref - q) + kd * (qd_ref - qd), clipped to +-limit as a whole.
     The position error is never wrapped: a start one turn away unwinds. The derivative
-    is zero for a demand beyond the limit, but not for a demand just at the limit.
+    is zero for a demand beyond the limit, but not just at it.
 
-    **Arguments:** one value per joint, in joint order, or one for all.
+    **Arguments:** one value per joint or one for all.
 
     - `kp`: proportional gains, not negative [N/m or N m/rad].
     - `kd`: gains of the error rate, not negative [N s/m or N m s/rad].
     - `limit`: largest effort [N or N m], may be infinite.
     - `reference`: a callable pytree, `(t, linkage) -> (q_ref, qd_ref)`.
 
-    **Raises:** ValueError for malformed or negative gains and limits, and for a
-    reference that is not callable.
+    **Raises:** ValueError for malformed arguments.
 
     >>> import fdof_jax as fj
     >>> arm = fj.scenes.fig7().linkage
@@ -85,8 +84,6 @@ class PDController(ScalarElement):
 
 
 class ModelBased(PDController):
-    """A PD controller with a model of the arm."""
-
     model: Linkage | None = None
 
     def __check_init__(self):
@@ -118,16 +115,14 @@ class ModelBased(PDController):
 class GravityFeedforward(ModelBased):
     """PD control plus the efforts that hold the arm's weight: a force element.
 
-    The effort is that of a `PDController` plus the effort that holds the arm at rest at
-    its actual position (not at the reference), clipped to +-limit as a whole. Plain PD
-    control sags under gravity, in Fig 7 by a quarter of a metre.
+    To the effort of a `PDController` it adds the effort that holds the arm at rest
+    where it is. The sum is clipped to +-limit [N or N m].
 
     **Arguments:**
 
-    - `kp`, `kd`, `limit`, `reference`: as in `PDController` [N/m or N m/rad, N s/m or
-      N m s/rad, N or N m].
-    - `model`: the controller's model of the arm; None: the arm itself. Masses of other
-      force elements, for instance of a load, are not included.
+    - `kp`, `kd`, `limit`, `reference`: as in `PDController`.
+    - `model`: the controller's model of the arm, by default the arm itself. It lacks
+      masses of other force elements, such as a load.
 
     **Raises:** ValueError for malformed arguments.
 
@@ -173,16 +168,14 @@ class ComputedTorque(ModelBased):
     clipped to +-limit as a whole. With an exact model and within the limits, the error
     of each joint obeys d2e/dt2 + kd de/dt + kp e = 0.
 
-    The acceleration qdd_ref is the time derivative of the reference's velocities,
-    without impulses where the velocities jump.
-
     **Arguments:** one value per joint or one for all.
 
     - `kp` [1/s^2], `kd` [1/s]: gains from errors to accelerations, not negative.
     - `limit`: largest effort [N or N m], may be infinite.
-    - `reference`: as in `PDController`; differentiable in time.
-    - `model`: the controller's model of the arm; None: the arm itself. Masses and
-      efforts of other force elements, for instance of a load, are not included.
+    - `reference`: as in `PDController`; differentiable in time. Jumps of its velocity
+      give no impulses.
+    - `model`: the controller's model of the arm, by default the arm itself. It lacks
+      masses and efforts of other force elements, such as a load.
 
     **Raises:** ValueError for malformed arguments.
 
@@ -222,17 +215,16 @@ def gains_from_frequency(
     """Computes the gains of PD control for given natural frequencies and damping.
 
     The gains are kp = frequency^2 M_kk and kd = 2 damping_ratio frequency M_kk, with
-    the inertia M_kk that joint k moves at `q` while the other joints stand still. A
-    joint then has exactly this frequency and damping if it moves alone, without gravity
-    and without springs or dampers. `closed_loop_modes` shows the modes of all joints
-    together, under all forces. The gains of `ComputedTorque` are frequency^2 and
-    2 damping_ratio frequency themselves.
+    the inertia M_kk that joint k moves at `q` while the others stand still. A joint
+    that moves alone, without gravity, springs or dampers, then has this frequency and
+    damping; for all joints together see `closed_loop_modes`. Gains of `ComputedTorque`
+    are frequency^2 and 2 damping_ratio frequency.
 
     **Arguments:**
 
     - `linkage`, `q`: the arm and its joint positions [m or rad].
-    - `frequency`: natural frequencies, one per joint or one for all, positive [rad/s].
-    - `damping_ratio`: one per joint or one for all, not negative.
+    - `frequency` [rad/s], positive, and `damping_ratio`, not negative: one per joint or
+      one for all.
     - `forces`: elements, of which those with masses count.
 
     **Returns:** `kp` [N/m or N m/rad] and `kd` [N s/m or N m s/rad], 0 at fixed pairs.

@@ -1,4 +1,4 @@
-"""Motion in time: the equations that are integrated, and what is read from them."""
+"""Motion in time: its equations, and what is read from them."""
 
 from .conditions import End, Until
 from .diffrax_term import ode_term

@@ -1,4 +1,4 @@
-"""Terms, states and arguments in arrays instead of tuples of scalars."""
+"""Motions in arrays instead of tuples of scalars."""
 
 import functools
 from collections.abc import Callable
@@ -44,9 +44,7 @@ def in_arrays(
 ) -> tuple[ScheduledTerm, Integrated, Args]:
     """Returns term, state and arguments in arrays instead of tuples of scalars.
 
-    XLA compiles a kernel for each array that changes in a loop or is computed for it,
-    in much the same time for one number as for many. Plain calls use arrays; batches
-    are faster with scalars.
+    Plain calls compile faster with arrays, batches run faster with scalars.
     """
     packed = args._replace(constants=_packed(args.constants))  # pyright: ignore[reportArgumentType]
     return _of_arrays(term), tuple(map(jnp.stack, y)), packed

@@ -17,17 +17,16 @@ _EXPECTED = "a function (t, q, qd, linkage) that returns a number"
 class Until(Element):
     """Ends a motion where a function of its state passes 0.
 
-    `simulate(..., until=g)` adds one to the forces. In a `Scene`, a sweep, a fit or a
-    search of gains it stands among them. It has no efforts. A motion that starts on the
-    zero does not end there.
+    `simulate(..., until=g)` takes plain functions. Use an `Until` to choose a
+    direction, or among the forces of a `Scene`, a sweep, a fit or a search of gains. A
+    motion that starts on the zero does not end there.
 
     **Arguments:**
 
     - `g`: `(t, q, qd, linkage) -> number`, of the time [s], joint positions and
-      velocities (n,) [m or rad], smooth near its zeros, in any unit in which it is not
-      tiny.
+      velocities (n,) [m or rad]. It is smooth near its zeros, and not tiny in its unit.
     - `direction`: 1 if the motion ends only where `g` rises through 0, -1 only where it
-      falls, 0 in both cases.
+      falls, 0 for both.
 
     **Raises:** ValueError for malformed arguments.
 
@@ -51,7 +50,7 @@ class Until(Element):
 
     @property
     def jump_ts(self) -> None:
-        """None: nothing happens to the motion before it ends."""
+        """None: nothing happens before the end."""
 
     def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
         value = self.condition(t, q, qd, linkage)
@@ -61,10 +60,9 @@ class Until(Element):
 class End(NamedTuple):
     """The end of a motion, with first and second derivatives.
 
-    - `t`: when it was [s]; `q`, `qd` (n,): the joint positions and velocities there
-      [m or rad].
+    - `t`: its time [s]; `q`, `qd` (n,): joint positions [m or rad] and velocities.
     - `condition`: the number of the condition that ended it, from 0 in the order of
-      `until`; -1 if none did, and the motion ended at its last time.
+      `until`; -1 if the motion ended at its last time.
 
     >>> import fdof_jax as fj
     >>> arm, start, *_ = fj.scenes.fig5()
@@ -81,7 +79,6 @@ class End(NamedTuple):
 
 
 def conditions(until: Any) -> tuple[Until, ...]:
-    """Returns `until` as a tuple of conditions."""
     if until is None:
         return ()
     several = until if isinstance(until, tuple | list) else (until,)
@@ -97,5 +94,4 @@ CONDITIONS = Reset, Until  # of which steps know the switching functions
 
 
 def conditions_in(forces: Forces) -> tuple[Until, ...]:
-    """Returns the conditions among elements."""
     return tuple(element for element in forces if isinstance(element, Until))

@@ -22,25 +22,18 @@ _Y = tuple[Array, Array, Array]  # positions, velocities, states of elements
 def ode_term(scene: Scene) -> tuple[diffrax.ODETerm, _Y, Args]:
     """Returns a scene as the term, start and arguments of a `diffrax.diffeqsolve`.
 
-    `diffrax.diffeqsolve(term, solver, 0, t1, dt0, y0, args)` offers what `simulate`
-    does not: dense solutions, diffrax's events, and noise by a `MultiTerm` (see the
-    recipes). It lacks what `simulate` adds. Steps do not end where elements jump or
-    switch, and derivatives there may be wrong. Mere rounding errors shorten steps. No
-    result reports a singular arm.
+    `diffrax.diffeqsolve(term, solver, 0, t1, dt0, y0, args)` offers dense solutions,
+    diffrax's events, and noise by a `MultiTerm` (see the recipes). Unlike `simulate`,
+    it does not end steps where elements jump or switch, so derivatives there may be
+    wrong. Rounding errors may shorten its steps, no result reports a singular arm, and
+    an `Until` has no effect.
 
-    **Arguments:**
+    **Returns:** `(term, y0, args)`. `y0` is `(q, qd, own)`: positions (n,) [m or rad],
+    velocities (n,), and the elements' own states in one array (m,).
+    `term.vf(t, y, args)` returns its rates.
 
-    - `scene`: its linkage, start and forces are used. Elements that hold joints, a
-      `Payload` that arrives, and a `PrescribedMotion` are rejected: only `simulate`
-      computes their blows.
-
-    **Returns:** `(term, y0, args)`. `term` is a `diffrax.ODETerm` of one function for
-    all scenes, so that scenes of one structure share a program. `y0` is `(q, qd, own)`:
-    positions (n,) [m or rad], velocities (n,), and the elements' own states, in order,
-    in one array (m,). `args` holds the linkage and the forces. `term.vf(t, y, args)`
-    returns the rates of `y`.
-
-    **Raises:** ValueError for malformed scenes.
+    **Raises:** ValueError for malformed scenes, and for elements that hold joints, a
+    `Payload` that arrives, a `Reset` and a `PrescribedMotion`.
 
     >>> import diffrax
     >>> import fdof_jax as fj
@@ -71,7 +64,6 @@ def ode_term(scene: Scene) -> tuple[diffrax.ODETerm, _Y, Args]:
 
 
 def _rates(t: Any, y: _Y, args: Args) -> _Y:
-    """Returns the rates of positions, velocities and the elements' own states."""
     q, qd, own = y
     state = whole(tuple(q - args.q0), tuple(qd), tuple(own))
     rates = *vector_field(t, state, args, schedule_of(t, args)), ()

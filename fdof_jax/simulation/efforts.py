@@ -1,4 +1,4 @@
-"""Computes the efforts of force elements along a motion."""
+"""Joint efforts along a motion."""
 
 from typing import NamedTuple
 
@@ -26,9 +26,8 @@ class Efforts(NamedTuple):
     """Joint efforts along a motion, 0 at fixed pairs [N or N m].
 
     - `total`: sum over all force elements (time, n).
-    - `elements`: efforts of each force element (element, time, n). The effort of a
-      motor is that of its element; the total has dampers, springs and loads as well.
-      Weights of added masses, a `Payload`'s for instance, are not among them.
+    - `elements`: those of each element (element, time, n), without weights of added
+      masses.
     """
 
     total: Float[Array, "time joint"]
@@ -36,7 +35,7 @@ class Efforts(NamedTuple):
 
 
 class _Held(ScalarElement):
-    """Efforts of a motion under sampled control: each holds until the next one."""
+    """Efforts of sampled control, each held until the next one."""
 
     begin: Float[Array, " sample"]
     tau: Float[Array, "sample joint"]
@@ -52,7 +51,7 @@ class _Held(ScalarElement):
 def acting_in(motion: Solution, forces: tuple[Element, ...]) -> tuple[Element, ...]:
     """Returns the elements that acted: held efforts in the place of a sampled control.
 
-    Raises ValueError if a motion under sampled control comes without its control.
+    Raises ValueError for a sampled motion without its control.
     """
     if motion.acting is None:
         return forces
@@ -65,14 +64,13 @@ def acting_in(motion: Solution, forces: tuple[Element, ...]) -> tuple[Element, .
 def joint_efforts(linkage: Linkage, forces: Forces, solution: Solution) -> Efforts:
     """Computes the joint efforts of the force elements along a motion.
 
-    **Arguments:** the linkage, the forces and the solution of one `simulate`. For
-    `simulate_sampled`, the forces are `(control, *forces)`. A `Scene` may stand for
-    linkage and forces: `joint_efforts(scene, solution)`.
+    **Arguments:** the linkage, the forces and the solution of one `simulate`, or
+    `joint_efforts(scene, solution)`. After `simulate_sampled`, the forces are
+    `(control, *forces)`.
 
-    **Returns:** `Efforts(total, elements)` [N or N m], of shapes (time, n) and
-    (element, time, n).
+    **Returns:** `Efforts` [N or N m].
 
-    **Raises:** ValueError if `forces` is not a tuple of force elements.
+    **Raises:** ValueError for malformed arguments, and for a batch (use `jax.vmap`).
 
     >>> import fdof_jax as fj
     >>> import numpy as np

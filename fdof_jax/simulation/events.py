@@ -1,4 +1,4 @@
-"""Events of joints that are held: what jumps there, which modes follow, the record."""
+"""Events of held joints: what jumps there, which modes follow, and the record."""
 
 import jax
 import jax.numpy as jnp
@@ -43,10 +43,10 @@ _STICKS, _SLIPS, _BOUNCES, _RESTS, _LEAVES, _BRAKED, _LET_GO, _STOPPED, _RESET =
 
 
 def resolve(event: Event, y: Integrated, args: Args) -> tuple[Integrated, Modes]:
-    """Returns the state and the modes after an event, `args.modes` being those before.
+    """Returns the state and the modes after an event; `args.modes` are those before.
 
-    In this order: brakes take hold, joints hit their stops, and what then is at rest
-    is held or begins to slide.
+    In this order: resets, impulses of prescribed motions, payloads, brakes, stops. What
+    is then at rest is held or begins to slide.
     """
     kinds = {kind for e in args.forces for kind in type(e).__mro__}
     before, law = args.modes, laws(args, event.t)
@@ -126,10 +126,9 @@ def resolve(event: Event, y: Integrated, args: Args) -> tuple[Integrated, Modes]
 
 
 def _stilled(qd: Array, joints: Array, still: Array) -> Array:
-    """Returns rates, 0 at those of the joints where they count as zero.
+    """Returns rates, 0 where those of `joints` count as zero; derivatives are kept.
 
-    Rounding errors would free what friction or a stop holds. What then slides off keeps
-    the derivatives of its rate.
+    Rounding errors would otherwise free what friction or a stop holds.
     """
     rests = joints & (jnp.abs(constant(qd)) <= constant(still))
     return jnp.where(rests, qd - constant(qd), qd)
@@ -138,10 +137,9 @@ def _stilled(qd: Array, joints: Array, still: Array) -> Array:
 def _at_the_blow(
     t: Array, y: Integrated, hits: Array, stop: Array, args: Args
 ) -> tuple[Integrated, Array]:
-    """Returns the state as the first joint hits its stop, and how long ago it did.
+    """Returns the state when the first joint hit its stop, and how long ago that was.
 
-    Steps end a little beyond zeros, or before. If only positions were put onto stops,
-    each blow would add or take energy.
+    If only positions moved back onto stops, each blow would add or take energy.
     """
     rates = _rates(t, y, args)
     q, qd, qdd = args.q0 + jnp.stack(y[0]), jnp.stack(y[1]), jnp.stack(rates[1])
@@ -165,7 +163,7 @@ def _taken(
     event: Event, q: Array, qd: Array, first: Array, args: Args, law: Laws,
     system: System,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Returns the rates after payloads were taken, and the energy lost.
+    """Returns the rates after payloads are taken, and the energy lost.
 
     M+ qd+ = M- qd- + J^T W v, over the joints that no brake holds.
     """
@@ -193,7 +191,7 @@ def _taken(
 def _net_efforts(
     t: Array, q: Array, qd: Array, own: list[Scalars], args: Args
 ) -> tuple[System, Array]:
-    """Returns the system, and the efforts less the bias, with friction of sliding."""
+    """Returns the system, and the efforts less the bias, with sliding friction."""
     args = args._replace(modes=args.modes._replace(direction=jnp.sign(qd)))
     y = tuple(q - args.q0), tuple(qd), *own
     tau, *_ = efforts(t, y, args, schedule_of(t, args))
@@ -206,8 +204,8 @@ def _after_blows(
 ) -> tuple[Array, Array]:
     """Returns the rates after all blows, and which joints were hit.
 
-    Blow by blow, that of the fastest joint first; what is left after one for each joint
-    is taken at once, without restitution.
+    The fastest joint comes first. After one blow per joint, what is left is stopped at
+    once, without restitution.
     """
     joints, moves = jnp.arange(qd.size), ~law.braked
     outward = lambda qd: constant(jnp.where(moves, touched * qd, 0))
@@ -238,9 +236,8 @@ def _settled(
 ) -> tuple[Array, Array]:
     """Returns the rates with joints stopped that bounce too low, and times left out.
 
-    What rests already stays at rest. One joint that rests may hold another at its stop,
-    so this is repeated once for each joint. Elastic joints would never rest: no time is
-    left out. `net`: the efforts less the bias.
+    A joint at rest may hold another at its stop, so this repeats once per joint. For
+    elastic joints no time is left out. `net`: the efforts less the bias.
     """
     lowest, elastic = jnp.finfo(qd.dtype).eps ** LOW, law.restitution == 1
     loses = jnp.where(elastic, 1, 1 - law.restitution)  # of its rate, at each bounce
@@ -285,7 +282,7 @@ def _happenings(before: Modes, after: Modes, hit: Array, law: Laws) -> Array:
 def _after_reset(
     element: Reset, met: Array, t: Array, y: Integrated, args: Args
 ) -> tuple[Integrated, Array]:
-    """Returns the state after a reset, if it is met, and the energy that it takes."""
+    """Returns the state after a reset, if it is met, and the energy it takes."""
     arm = args.linkage
     name = f"forces[{place_of(element, args.forces)}]"
 
@@ -304,10 +301,7 @@ def _after_reset(
 
 
 def _recorded(events: Events, t: Array, kind: Array, first: int = 1) -> Events:
-    """Returns the events with those of all joints to which something happens.
-
-    `first`: the number of the first of these joints.
-    """
+    """Adds to the events what happens to the joints from number `first` on."""
     happens = kind >= 0
     places = (events.count + jnp.cumsum(happens) - 1) % MOST_EVENTS
     places = jnp.where(happens, places.astype(int), MOST_EVENTS)  # dropped
@@ -324,9 +318,9 @@ def _recorded(events: Events, t: Array, kind: Array, first: int = 1) -> Events:
 
 
 def in_order(events: Events, valid: Array) -> Events:
-    """Returns the events in the order of time, NaN beyond the last of them.
+    """Returns the events in the order of time, NaN beyond the last.
 
-    Those of invalid inputs are none: they belong to values put in their place.
+    Invalid inputs have none: theirs belong to stand-in values.
     """
     count = jnp.where(valid, events.count, 0)
     first = jnp.where(count > MOST_EVENTS, count % MOST_EVENTS, 0).astype(int)

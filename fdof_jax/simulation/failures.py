@@ -1,4 +1,4 @@
-"""Causes of failed motions, in words; looked for only after a failure."""
+"""Explains failed motions in words."""
 
 import inspect
 
@@ -39,7 +39,7 @@ _NEARLY_SINGULAR, _NEAR = 1e6, 1e-6
 
 
 def cause(inputs: Inputs, keywords: Settings, solution: Solution) -> str:
-    """Returns what is known about a failed solve, in a sentence."""
+    """Returns the known cause of a failed solve, in a sentence."""
     linkage, (q, qd), ts, own0, forces, _ = inputs
     outcome = str(solution.outcome)
     if outcome == "not finite":
@@ -159,7 +159,7 @@ def _of_steps(inputs: Inputs, keywords, solution: Solution) -> str:
 
 
 def _of_steep_efforts(inputs: Inputs) -> str:
-    """Names the element whose effort a singular arm makes grow at the start."""
+    """Names the element whose effort changes too fast near a singular start."""
     linkage, (q, qd), ts, own0, forces, _ = inputs
     if not (singular := _of_singular_arm(linkage, q)):
         return ""
@@ -203,14 +203,13 @@ def _linearised(
     linkage: Linkage, forces: tuple[Element, ...], t: Array, q: Array, qd: Array,
     own: OwnStates | None,
 ) -> Array:  # fmt: skip
-    """Returns the matrix of the linearised equations of first order."""
     args, term = args_of(linkage, q, forces), term_of(forces)
     start = start_of(args, qd, initial_own(args, own))
     return linearised(term, t, start, args, term.schedule(t, args))
 
 
 def check_arguments(forces: tuple[Element, ...]) -> None:
-    """Raises TypeError for a plain function that cannot be called as an element."""
+    """Raises TypeError for a plain function with other arguments than an element's."""
     for k, element in enumerate(forces):
         place = "until" if isinstance(element, Until) else f"forces[{k}]"
         functions = {"": element}

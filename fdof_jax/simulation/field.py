@@ -1,4 +1,4 @@
-"""The vector field of a linkage with force elements, as integrators call it."""
+"""The vector field of a linkage with force elements."""
 
 import functools
 import operator
@@ -64,22 +64,19 @@ class Args(NamedTuple):
         return t if self.lead is None else t + self.lead[index]
 
     def masses(self, t: Array) -> tuple[InertialElement, ...]:
-        """Returns the elements that move masses, as they are at a time."""
+        """Returns the elements that move masses, as at time `t`."""
         rows = enumerate(self.forces)
         masses = [(k, e) for k, e in rows if isinstance(e, InertialElement)]
         return tuple(element.at(self.clock(k, t)) for k, element in masses)
 
     @property
     def moved(self) -> Array | None:
-        """Flags (n,) of the joints whose motion is prescribed; None without any."""
+        """Flags (n,) of prescribed joints; None without any."""
         motion = prescribed(self.forces)
         return None if motion is None else motion.prescribes(self.linkage)
 
     def moving(self, held: Array | None = None) -> Constants:
-        """Returns the constants with joints that are not driven as fixed pairs.
-
-        These are the prescribed ones and those that are held: by default all.
-        """
+        """Returns the constants with prescribed and held joints as fixed pairs."""
         constants, moved = self.constants, self.moved
         if held is None and self.modes is not None:
             held = self.modes.held
@@ -96,7 +93,6 @@ def args_of(linkage: Linkage, q0: Array, forces: tuple[Element, ...]) -> Args:
 
 
 def schedule_of(t: Array, args: Args) -> Schedules:
-    """Returns each element's schedule."""
     schedules = []
     for index, element in enumerate(args.forces):
         with naming(f"forces[{index}]"):
@@ -106,10 +102,6 @@ def schedule_of(t: Array, args: Args) -> Schedules:
 
 
 def has_states(linkage: Linkage, forces: tuple[Element, ...]) -> bool:
-    """Returns whether there is a number in any element's state; some drives have none.
-
-    A `SpeedLimit`, for instance, has no state but that of its command.
-    """
     states = jax.eval_shape(lambda: initial_states(linkage, forces))
     return bool(jax.tree.leaves(states))
 
@@ -125,24 +117,22 @@ def with_states(
 
 
 def initial_states(linkage: Linkage, forces: tuple[Element, ...]) -> OwnStates:
-    """Returns the first states of elements with a state of their own, maybe empty."""
     stateful = (e for e in forces if isinstance(e, StatefulElement))
     return tuple(element.initial_state(linkage) for element in stateful)
 
 
 def initial_own(args: Args, own0: OwnStates | None = None) -> Scalars:
-    """Returns the elements' initial states as scalars: `own0`, or their defaults."""
+    """Returns `own0`, or the elements' initial states, as scalars."""
     own = initial_states(args.linkage, args.forces) if own0 is None else own0
     return _scalars(own, args.q0.dtype)
 
 
 def whole(delta: Scalars, qd: Scalars, own: Scalars) -> Integrated:
-    """Returns an integrated state, or its rates; diffrax takes no empty tuple in it."""
+    """Returns an integrated state, or its rates, without an empty tuple."""
     return (delta, qd, own) if own else (delta, qd)
 
 
 def own_states(args: Args, y: Integrated) -> OwnStates:
-    """Rebuilds the states of the stateful elements from the integrated scalars."""
     left = iter(y[2] if len(y) > 2 else ())
     return jax.tree.map(
         lambda leaf: jnp.array([*islice(left, leaf.size)]).reshape(leaf.shape),
@@ -160,7 +150,7 @@ def followed(
 ) -> tuple[Integrated, Scalars | None]:
     """Returns a state with prescribed joints where they are, and accelerations.
 
-    The accelerations are 0 at other joints; they are None if no joint is prescribed.
+    These are 0 at other joints, and None without prescribed ones.
     """
     if (motion := prescribed(args.forces)) is None:
         return y, None
@@ -172,9 +162,9 @@ def followed(
 
 
 def with_prescribed_rates(t: Array, y: Integrated, args: Args) -> Integrated:
-    """Returns a state after the blow of a change of the prescribed velocities.
+    """Returns a state after the blow of a jump of prescribed velocities.
 
-    M_FF dqd_F = -M_FH dqd_H; joints that are held stay so.
+    M_FF dqd_F = -M_FH dqd_H; held joints stay held.
     """
     there, _ = followed(y, args, schedule_of(t, args))
     delta, qd, *own = there
@@ -189,10 +179,7 @@ def with_prescribed_rates(t: Array, y: Integrated, args: Args) -> Integrated:
 def efforts(
     t: Array, y: Integrated, args: Args, schedule: Schedules
 ) -> tuple[Scalars, Scalars, Switches]:
-    """Returns efforts of the elements, rates of their states, and their switches.
-
-    Builds arrays only where an element needs them.
-    """
+    """Returns efforts of the elements, rates of their states, and their switches."""
     delta, qd, *_ = y
     tau, own_rates = None, []
     switches = Switches(args.sides)
@@ -226,7 +213,7 @@ def efforts(
 def switching(
     t: Array, y: Integrated, args: Args, schedule: Schedules
 ) -> tuple[Array, tuple[bool, ...]]:
-    """Returns the switching functions of all efforts, and which of them jump."""
+    """Returns all switching functions, and which of them jump."""
     y, _ = followed(y, args, schedule)
     *_, switches = efforts(t, y, args, schedule)
     return switches.all_values(args.q0.dtype), tuple(switches.jumping)
@@ -236,8 +223,9 @@ class Drive(NamedTuple):
     """Causes of motion at a state.
 
     - `delta`, `qd`: displacements and velocities, prescribed ones as they are.
-    - `tau`: efforts on the joints that are driven, less what prescribed ones take.
-    - `own_rates`: of the elements' states; `added`: inertia of masses that they move.
+    - `tau`: efforts, less what prescribed joints and added masses take.
+    - `own_rates`: of the elements' states; `added`: inertia of their masses.
+    - `given`: prescribed accelerations, or None.
     """
 
     delta: Scalars
@@ -250,7 +238,6 @@ class Drive(NamedTuple):
 
 
 def applied(t: Array, y: Integrated, args: Args, schedule: Schedules) -> Drive:
-    """Returns what drives the joints at a state."""
     y, given = followed(y, args, schedule)
     tau, own_rates, switches = efforts(t, y, args, schedule)
     delta, qd, *_ = y
@@ -266,7 +253,7 @@ def applied(t: Array, y: Integrated, args: Args, schedule: Schedules) -> Drive:
 def _added_at(
     t: Array, delta: Scalars, qd: Scalars, args: Args
 ) -> tuple[Upper | None, Array | None]:
-    """Returns the inertia that elements add and its bias, None if none does."""
+    """Returns the inertia that elements add, and its bias; None without any."""
     if not inertial(args.forces):
         return None, None
     q = args.q0 + jnp.stack(delta)
@@ -277,7 +264,7 @@ _added: Any = eqx.filter_jit(added_inertia)  # traced once, not at each use by a
 
 
 def health_at(losses: Scalars) -> Health:
-    """Returns the health at losses of accuracy: these, or 0 if too much is lost."""
+    """Returns these losses of accuracy as a health: 0 if too much is lost."""
     least = LEAST_INERTIA_RATIO[losses[0].dtype]
     # Exactly, no loss is below 1; that of a fixed pair is stored as 0.
     return tuple(
@@ -290,19 +277,19 @@ def health_with(rates: PyTree, health: Health) -> Health:
 
 
 def vector_field(t, y, args, schedule) -> Integrated:
-    """Rates of joint displacements, of velocities and of the elements' own states."""
+    """Rates of displacements, velocities and the elements' own states."""
     at = applied(t, y, args, schedule)
     qd, qdd = rates(args.moving(), at.delta, at.qd, at.tau, at.added)
     return whole(qd, _with(at.given, qdd), at.own_rates)
 
 
 def _with(given: Scalars | None, qdd: Scalars) -> Scalars:
-    """Adds the prescribed accelerations to those of the other joints."""
+    """Adds prescribed accelerations to those of other joints."""
     return qdd if given is None else tuple(map(operator.add, qdd, given))
 
 
 def watched_field(t, y, args, schedule) -> tuple[Integrated, Health]:
-    """Rates of `vector_field` and their health, which `ScheduledTerm` defines."""
+    """Rates, and their health as in `ScheduledTerm`."""
     at = applied(t, y, args, schedule)
     (qd, qdd), losses = rates_and_conditioning(
         args.moving(), at.delta, at.qd, at.tau, at.added
@@ -313,7 +300,7 @@ def watched_field(t, y, args, schedule) -> tuple[Integrated, Health]:
 
 
 def health_of(t, y, args) -> Health:
-    """Health of the equations at each joint: positive, or 0 where they are singular."""
+    """Health of the equations at each joint, as in `ScheduledTerm`."""
     if prescribed(args.forces) is not None:
         y, _ = followed(y, args, schedule_of(t, args))
     delta, qd, *_ = y
@@ -324,7 +311,7 @@ def health_of(t, y, args) -> Health:
 def total_effort(
     linkage: Linkage, forces: tuple[Element, ...], t: Array, q: Array, qd: Array
 ) -> Array:
-    """Computes the sum of elements' efforts in their initial states [N or N m]."""
+    """Sums the elements' efforts in their initial states [N or N m]."""
     total = jnp.zeros_like(q)
     for k, element in enumerate(forces):
         state = element.initial_state(linkage)
@@ -341,10 +328,7 @@ def element_effort(
     linkage: Linkage,
     state: PyTree,
 ) -> Array:
-    """Returns an element's effort.
-
-    Raises ValueError unless it is a real number for each joint.
-    """
+    """Returns an element's effort; raises ValueError unless it is n real numbers."""
     return effort_and_switches(index, element, t, q, qd, linkage, state)[0]
 
 

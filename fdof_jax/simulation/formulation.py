@@ -27,7 +27,7 @@ from .holding import changes, guarded_switching, unknown_modes
 from .prescribed import prescribed
 from .sampling import ClockElement, SampleState, after_samples, sampler_of
 
-# By which a clock is ahead of the next one, in units of `clearance`: beyond the
+# By which a clock is ahead of the one before, in units of `clearance`: beyond the
 # distances that steps keep from each time.
 _LEAD = 8
 
@@ -40,7 +40,6 @@ _HOLDING = ScheduledTerm(
 
 
 def term_of(forces: Forces) -> ScheduledTerm:
-    """Returns the equations of a motion."""
     follows, samples = prescribed(forces) is not None, sampler_of(forces) is not None
     return _term(changes(forces), follows, samples)
 
@@ -70,7 +69,6 @@ def start_of(args: Args, qd: Array, own: Scalars) -> Integrated:
 
 
 def joints_at(args: Args, t: Array, y: Integrated) -> tuple[Array, Array]:
-    """Returns joint positions and velocities at an integrated state."""
     q, qd = args.q0 + jnp.stack(y[0]), jnp.stack(y[1])
     if (motion := prescribed(args.forces)) is None:
         return q, qd
@@ -82,10 +80,9 @@ def joints_at(args: Args, t: Array, y: Integrated) -> tuple[Array, Array]:
 def clocks_apart(args: Args, ts: Array) -> Args:
     """Returns the arguments with clocks by which no two elements jump at once.
 
-    If times coincided, one step would end at all of them, and derivatives would
-    attribute the jumps of all elements to one of them. Each clock is ahead of the one
-    before by some units of rounding. Those of a controller are behind all others: it
-    measures what is left of a blow, and its commands arrive after its samples.
+    Otherwise derivatives would attribute all jumps to one element. Each clock is ahead
+    of the one before by some units of rounding. A controller's are behind all others,
+    because it measures what is left of a blow.
     """
     # A prescribed motion also gives positions, and comes first: it keeps the time.
     motion = prescribed(args.forces)
@@ -108,10 +105,7 @@ def clocks_apart(args: Args, ts: Array) -> Args:
 
 
 def known_times(args: Args) -> tuple[Array | None, tuple[Clock, ...]]:
-    """Returns the times [s] at which elements jump by their clocks, and these clocks.
-
-    The times are None if there are none.
-    """
+    """Returns the times [s] at which elements jump, None without any, and clocks."""
     times, clocks = [], []
     for index, element in enumerate(args.forces):
         lead = 0 if args.lead is None else args.lead[index]

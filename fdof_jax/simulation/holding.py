@@ -1,12 +1,12 @@
-"""Joints that are held for a while: their modes, what ends them, and what then jumps.
+"""Joints that are held for a while: their modes, and what ends these.
 
-H are the joints held, F the others; tau holds the efforts of all but the holders:
+H are the joints held, F the others; c is the effort of the holders (the paper's
+generalised constraint force), tau that of all others:
 
     qdd_H = 0,   M_FF qdd_F = tau_F - b_F,   c_H = M_HF qdd_F + b_H - tau_H
 
-c is the effort of the holders, the paper's generalised constraint force. A mode lasts
-while its guards are positive; they are switching functions, so that steps end where
-one comes to its zero. There `resolve` (events.py) finds the modes that follow.
+Guards are positive while a mode lasts. Steps end at their zeros, where `resolve`
+(events.py) finds the next modes.
 """
 
 from collections.abc import Callable
@@ -53,10 +53,9 @@ class Modes(NamedTuple):
     """The modes of the joints, as part of the integrated state.
 
     - `mode` (n,): FREE, FRICTION, LOWER, UPPER or BRAKE; negative before the start.
-    - `direction` (n,): of the sliding that friction resists: 1, -1, or 0 if held.
-    - `origin` (n,): displacements at which these slides began [m or rad].
-    - `taken`: the energy that holders have taken before [J].
-    - `events`: those up to here.
+    - `direction` (n,): 1 or -1 where friction resists sliding, else 0.
+    - `origin` (n,): displacements at which sliding began [m or rad].
+    - `taken`: energy that holders took before [J].
     """
 
     mode: Array
@@ -71,7 +70,7 @@ class Modes(NamedTuple):
 
 
 class Laws(NamedTuple):
-    """The laws of all holders, in joint order: (n,) each; frictions as of `toward`."""
+    """The laws of all holders, (n,) each in joint order; frictions as in `toward`."""
 
     level: Array
     static: Array
@@ -86,14 +85,14 @@ class Laws(NamedTuple):
 
 
 def _sum(friction: Array, more: Array) -> Array:
-    """Returns the sum of frictions, of which either may have two rows."""
+    """Returns the sum of frictions, either of which may have two rows."""
     return jnp.add(*jnp.broadcast_arrays(friction, more))
 
 
 def laws(args: Args, t: Array, *state: Array) -> Laws:
-    """Returns the laws of all holders at a time and at positions and rates.
+    """Returns the laws of all holders at a time, positions and rates.
 
-    Without these, friction that depends on them counts as almost 0.
+    Without the latter, friction that depends on them counts as almost 0.
     """
     joints = joints_of(args.linkage)
     fixed = jnp.stack(fixed_pairs(args.linkage.ef))
@@ -137,9 +136,8 @@ def unknown_modes(args: Args) -> tuple[Modes, int]:
 def _reserve(static: Array, mode: Array, effort: Array, inertia: Array) -> Array:
     """Returns by how much efforts may grow before held joints come free.
 
-    Of friction, near both limits, this is the distance from the nearer one, as
-    a share of the limit. That of a stop is per inertia [m/s^2 or rad/s^2]. Either is of
-    much the same size in large machines and in tiny ones.
+    Near a limit of friction it is a share of the limit; at a stop it is per inertia
+    [m/s^2 or rad/s^2]. So it has similar sizes in large machines and in tiny ones.
     """
     ahead, behind = toward(static, 1), toward(static, -1)
     mean = (ahead + behind) / 2
@@ -155,8 +153,8 @@ def guarded_switching(
 ) -> tuple[Array, tuple[bool, ...]]:
     """Returns the switching functions of all efforts, and after them the guards.
 
-    For each joint one that shows whether it stays as it is: held within its limits, or
-    sliding. With stops, for each joint that is free: the distances from them.
+    Each joint has one, positive as long as it stays held, or goes on sliding. With
+    stops, two more are its distances from them while it is free.
     """
     at = applied(t, y, args, schedule)
     driven = at.delta, at.qd, at.tau, at.added
@@ -182,8 +180,6 @@ def guarded_switching(
 
 
 class System(NamedTuple):
-    """The linear system of the joints at one configuration."""
-
     constants: Constants
     equations: Equations
     added: Upper | None
@@ -191,7 +187,7 @@ class System(NamedTuple):
     def accelerations(
         self, efforts: Array, held: Array, once: Callable = lambda x: x
     ) -> Array:
-        """Returns those of joints that are not held, 0 at the others."""
+        """Returns the accelerations, 0 at joints that are held."""
         constants = with_held(self.constants, tuple(held))
         solve, _ = solver_of(constants, self.equations, self.added, divided)
         return jnp.stack(once(solve(tuple(efforts))))
@@ -200,7 +196,7 @@ class System(NamedTuple):
         return jnp.stack(times(self.equations.mass, tuple(qd)))
 
     def still(self, *rates: Array) -> Array:
-        """Returns up to which rates count as zero after a blow, (n,)."""
+        """Returns the rates (n,) that count as zero after a blow."""
         energies = jnp.stack([qd @ self.momenta(qd) for qd in rates])
         inertia = jnp.where(self.inertia > 0, self.inertia, jnp.inf)
         return (
@@ -216,7 +212,7 @@ class System(NamedTuple):
     def caught(self, qd: Array, held: Array) -> Array:
         """Returns the rates after a blow that stops joints.
 
-        M_FF qd_F+ = M_FF qd_F + M_FB qd_B, with B the joints that are stopped.
+        M_FF qd_F+ = M_FF qd_F + M_FB qd_B, with B the joints stopped.
         """
         change = self.accelerations(self.momenta(jnp.where(held, qd, 0)), held)
         return jnp.where(held, 0, qd + change)
@@ -225,7 +221,7 @@ class System(NamedTuple):
 def system_at(t: Array, q: Array, qd: Array, args: Args) -> System:
     """Returns the system at a configuration, with the bias at these rates.
 
-    Prescribed joints are fixed pairs in it, and what they take is part of the bias.
+    Prescribed joints are fixed pairs; the bias includes what they take.
     """
     added, more = added_inertia(args.linkage, args.masses(t), q, qd)
     m = with_added(added, equations(args.constants, tuple(q - args.q0), tuple(qd)))
@@ -238,10 +234,7 @@ def system_at(t: Array, q: Array, qd: Array, args: Args) -> System:
 
 
 def within_stops(forces: Forces, q: Array, linkage: Linkage) -> Truth:
-    """Returns whether an arm is within its hard stops, but for rounding.
-
-    Fixed pairs have no stops.
-    """
+    """Returns whether real joints are within their hard stops, but for rounding."""
     near = jnp.sqrt(jnp.finfo(q.dtype).eps)
     stops = [e for e in forces if isinstance(e, HardStops)]
     if not stops:
@@ -252,7 +245,7 @@ def within_stops(forces: Forces, q: Array, linkage: Linkage) -> Truth:
 
 
 def leaves_prescribed(forces: Forces, linkage: Linkage) -> Truth:
-    """Returns whether no stop and no brake is at a joint whose motion is prescribed."""
+    """Returns whether prescribed joints have no stop and no brake."""
     if (motion := prescribed(forces)) is None:
         return True
     moved, alone = motion.prescribes(linkage), jnp.array(True)
@@ -278,9 +271,9 @@ def at_rest(
 ) -> Modes:  # fmt: skip
     """Returns the modes of joints with these rates, and directions of sliding.
 
-    Their accelerations solve a convex problem: minimise (qdd - a)^T M (qdd - a) / 2 +
-    sum level abs(qdd) over the joints at rest. One joint after the other changes its
-    mode, until all agree with their laws (Murty's principal pivoting).
+    Accelerations of joints at rest minimise (qdd - a)^T M (qdd - a) / 2 + sum level
+    abs(qdd), which is convex. One joint after the other changes its mode, until all
+    agree with their laws (Murty's principal pivoting).
     """
     qd, touched, law, system, net = constant((qd, touched, law, system, net))
     m, efforts = in_one_loop((system.equations, tuple(net)))
@@ -332,7 +325,7 @@ def at_rest(
 
 
 def taken_at(args: Args, ts: Array, modes: Modes, q: Array) -> Array:
-    """Returns the energy that holders have taken (time,), from modes at times [J]."""
+    """Returns the energy that holders have taken (time,) [J], from modes at times."""
 
     def taken(t, direction, origin, before, q):
         slide = direction * (q - args.q0 - origin)
@@ -345,10 +338,10 @@ def taken_at(args: Args, ts: Array, modes: Modes, q: Array) -> Array:
 def efforts_of_holders(
     linkage: Linkage, forces: Forces, t: Array, q: Array, qd: Array, tau: Array
 ) -> Array:
-    """Computes the effort of each element by which it holds joints, (element, n).
+    """Computes the effort by which each element holds joints, (element, n).
 
-    `tau`: the sum of all efforts without these. What is held is at rest, exactly. A
-    stop pushes, and friction takes what would pull at it.
+    `tau`: the sum of all others. Held joints are exactly at rest. A stop pushes, and
+    friction takes what would pull at it.
     """
     args = args_of(linkage, q, forces)
     modes, _ = unknown_modes(args)

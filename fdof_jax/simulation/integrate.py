@@ -1,7 +1,4 @@
-"""Integrates the equations of motion: free, prescribed, differentiated.
-
-`integrate` is the one way in: it prepares, controls, solves and reads.
-"""
+"""Integrates the equations of motion: prepares, controls, solves and reads."""
 
 import dataclasses
 from collections.abc import Callable
@@ -48,7 +45,6 @@ Settings = dict[str, Any]
 class Inputs(NamedTuple):
     """The arguments that determine a motion, as `simulate` gets them.
 
-    - `own0`: initial states of the elements, or None for their defaults.
     - `known_ef`: existence factors that the program may contain, or None.
     """
 
@@ -63,10 +59,9 @@ class Inputs(NamedTuple):
 class _Motion(NamedTuple):
     """A motion to compute.
 
-    - `valid`: whether the inputs were; others have stand-ins here.
+    - `valid`: whether the inputs are; stand-ins replace others.
     - `first`: positions and velocities at the first time.
-    - `problem`: the equations and their start; `jumps`, `clocks`: known times at which
-      they jump.
+    - `jumps`, `clocks`: known times of jumps.
     - `joints(t, y)`: reads positions, velocities and the elements' own states.
     """
 
@@ -87,10 +82,9 @@ def integrate(
 ) -> Solution:
     """Integrates one motion, by default with `LoopedDopri8`.
 
-    `derivatives`: whether steps are kept short enough for accurate derivatives.
-    `plain`: whether this is one motion outside of transformations. Its last time may be
-    repeated.
-    `tangents`: judges tangents over which the caller maps, along the axis `TANGENTS`.
+    `derivatives`: whether steps suit accurate derivatives. `plain`: whether outside of
+    transformations; the last time may then repeat. `tangents`: judges tangents that the
+    caller maps along `TANGENTS`.
     """
     motion = _prepare(inputs, derivatives, plain, bool(tangents and tangents.tolerance))
     scheme = _scheme(motion, keywords, derivatives, tangents)
@@ -104,7 +98,6 @@ def integrate(
 def _prepare(
     inputs: Inputs, derivatives: bool, plain: bool, searching: bool = False
 ) -> _Motion:
-    """States the equations and their start."""
     linkage, state0, ts, own0, forces, ef = inputs
     # An arm may be of a time before double precision was chosen.
     linkage = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), linkage)
@@ -142,7 +135,6 @@ def _prepare(
 def _scheme(
     motion: _Motion, keywords, derivatives: bool, tangents: TangentJudge | None
 ) -> loop.Scheme:
-    """Chooses the steps: what judges them, and where they end."""
     given = keywords["stepsize_controller"]  # by the user
     controller = given or default_controller()
     method = _differentiable(keywords["solver"] or LoopedDopri8(), keywords["adjoint"])
@@ -186,8 +178,8 @@ def _probe(
 ) -> ProbeJudge | None:
     """Returns what judges derivatives, None if nothing does.
 
-    Implicit methods with tolerances of the user's are meant to leave fast motions
-    unresolved; the steps of a probe would resolve them.
+    A user's tolerances let implicit methods leave fast motions unresolved; a probe
+    would resolve them.
     """
     if own_tolerance and isinstance(method, diffrax.AbstractImplicitSolver):
         return None
@@ -218,21 +210,20 @@ def _check_constant_steps(forces: tuple[Element, ...], controller: object) -> No
 def _read(
     inputs: Inputs, motion: _Motion, end: loop.Attempt, keywords: Settings
 ) -> Solution:
-    """Reads joint states, statistics and the result."""
     linkage, state0, times, *_ = inputs
     valid, ts = motion.valid, motion.problem.ts
     states, modes, sampled = end.rows
     q, qd, own = jax.vmap(motion.joints)(ts, states)
 
     def shown_at(a):
-        """Replaces infinity at times that were not reached by NaN."""
+        """Replaces infinity by NaN, at times that were not reached."""
         return jnp.where(jnp.isinf(a) | ~valid, jnp.nan, a)
 
     # The start is saved with the first step, after any blow there.
     saved = None if modes is None else jnp.isfinite(qd[0]) & valid
 
     def from_start(rows, start, given):
-        """Returns rows whose first one is the start, or what was given if invalid."""
+        """Returns rows that begin with the start, or what was given if invalid."""
         first = jnp.where(valid, start, given)
         if saved is not None:
             first = jnp.where(saved, rows[0], first)
@@ -276,7 +267,7 @@ def _read(
 def _with_end(
     solution: Solution, motion: _Motion, events: Any, end: loop.Attempt
 ) -> Solution:
-    """Returns a solution with its end: where a condition was met, or its last row."""
+    """Returns a solution with its `End`."""
     switches: Any = end.switches
     args = motion.problem.args._replace(sampled=end.sampled)
     t, y = events.at_end(end.t, end.y, args, switches)
@@ -294,7 +285,7 @@ def _with_end(
 def last_switched(inputs: Inputs, keywords: Settings) -> Array:
     """Returns which switching functions switched where a motion ended, (switch,).
 
-    In the order of the elements; guards of modes are the last ones.
+    Guards of modes come last.
     """
     keywords = keywords | {"adjoint": diffrax.ForwardMode()}
     motion = _prepare(inputs, derivatives=False, plain=False)
@@ -320,8 +311,7 @@ def _differentiable(
 def faults(inputs: Inputs, times: bool = True) -> list[Array]:
     """Returns whether times, start, linkage and each element are at fault.
 
-    `times`: whether those are looked at, too; those of a plain call may repeat the last
-    one.
+    `times`: whether to check the times; the last one of a plain call may repeat.
     """
     linkage, state0, ts, _, forces, _ = inputs
     growth = jnp.diff(ts)

@@ -1,7 +1,4 @@
-"""Jacobians of motions in a few parameters, by tangents beside the motion.
-
-All tangents take the same steps, which their errors decide as well as the motion's.
-"""
+"""Jacobians of motions in a few parameters, by tangents beside the motion."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -39,7 +36,7 @@ def along_each(
 ) -> tuple[PyTree, PyTree, PyTree]:
     """Returns a value, its derivatives along directions, and what comes with it.
 
-    `function(z)` integrates with `tangents`, and returns the value and the rest.
+    `function(z)` returns the value and the rest.
     """
 
     def along(direction):
@@ -58,12 +55,11 @@ def jacobian_of(
 ) -> Sensitivities:
     """Computes residuals of a simulated scene and their Jacobian in `z` (n,).
 
-    The function is pure. A motion that fails is NaN from then on.
+    A motion that fails is NaN from then on.
 
-    **Arguments:** `scene_at`: maps the parameters `z` to a scene; `residuals`: maps the
-    scene and its motion at the times `ts` to an array; `tolerance`: relative and
-    absolute tolerance of each step in float64. Tangents have 100 times that, relative
-    to the largest of them.
+    **Arguments:** `scene_at`: maps `z` to a scene; `residuals`: maps the scene and its
+    motion at the times `ts` to an array; `tolerance`: relative and absolute tolerance
+    of a step in float64. Tangents have 100 times that, relative to the largest.
     """
     tolerance = of_precision(tolerance, max(tolerance, SINGLE_TOLERANCE))
     keywords: dict[str, Any] = dict(

@@ -1,12 +1,11 @@
 """Hybrid dynamics: some joints follow a prescribed motion, the others are driven.
 
-H are the joints that are prescribed, F the others:
+H are the prescribed joints, F the others:
 
     M_FF qdd_F = tau_F - b_F - M_FH qdd_H
 
-Where a prescribed velocity jumps, so do the others: M_FF dqd_F = -M_FH dqd_H. This is
-done where each step begins, with what the state lacks of the prescribed velocity: all
-of a jump, or else hardly more than a rounding error.
+Where a prescribed velocity jumps, so do the others: M_FF dqd_F = -M_FH dqd_H. Each step
+begins with this correction; without a jump it is hardly more than rounding.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,25 +31,20 @@ from ..references.reference import EXPECTED, reference_motion
 class PrescribedMotion(Element):
     """Joints that follow a reference exactly, whatever effort that takes.
 
-    Where the reference's velocity jumps, an impulse makes the velocities of the other
-    joints jump too. `joint_efforts` returns the effort [N or N m] without impulses,
-    among its `elements`.
+    Where the reference's velocity jumps, an impulse makes the velocities of other
+    joints jump too. If `state0` has other velocities than the reference, the motion
+    starts with such an impulse, and its first velocities are those after it.
+    `joint_efforts` returns the effort [N or N m] without impulses.
 
-    The velocities of `state0` are those before the first time. If they differ from the
-    reference's, the motion starts with an impulse, and its first velocities are those
-    after it.
-
-    Other joints may stick, hit stops or be braked. Friction at a prescribed joint adds
-    to its effort but is not counted in `Solution.taken`; stops and brakes there are
-    rejected.
+    Friction at a prescribed joint adds to its effort but is not counted in
+    `Solution.taken`. Stops and brakes there are rejected.
 
     **Arguments:**
 
-    - `joints`: the number of a prescribed joint, from 1, or several such numbers.
+    - `joints`: the number of a prescribed joint, from 1, or several.
     - `reference`: `(t, linkage) -> (q, qd)`, as for a `PDController`; values for other
-      joints and for fixed pairs are ignored. The positions must be continuous and equal
-      those of `state0` at the start of a simulation; the velocities must be their
-      rates.
+      joints are ignored. The positions are continuous and start at those of `state0`;
+      the velocities are their rates.
 
     **Raises:** ValueError for malformed arguments.
     """
@@ -66,7 +60,7 @@ class PrescribedMotion(Element):
         return {"joints": numbers_in(self.moved), "reference": self.reference}
 
     def prescribes(self, linkage: Linkage) -> Array:
-        """Returns whether each joint of an arm is prescribed; a fixed pair is not."""
+        """Returns whether each joint is prescribed; a fixed pair is not."""
         fixed = jnp.stack(fixed_pairs(linkage.ef))
         return self.moved[: joints_of(linkage)] & ~fixed
 
@@ -87,7 +81,6 @@ class PrescribedMotion(Element):
 
 
 def prescribed(forces: Forces) -> PrescribedMotion | None:
-    """Returns the `PrescribedMotion` among the elements, or None."""
     motions = [e for e in forces if isinstance(e, PrescribedMotion)]
     if len(motions) > 1:
         raise refusal("forces", "one PrescribedMotion at most", len(motions))
@@ -95,7 +88,7 @@ def prescribed(forces: Forces) -> PrescribedMotion | None:
 
 
 def agrees(forces: Forces, t: Array, q: Array, linkage: Linkage) -> Truth:
-    """Returns whether prescribed joints are at the reference, to 1 in a million."""
+    """Returns whether prescribed joints are at the reference, to 1e-6."""
     if (motion := prescribed(forces)) is None:
         return True
     with naming(f"forces[{place_of(motion, forces)}]"):

@@ -1,4 +1,4 @@
-"""Control in discrete time, with efforts held constant between samples."""
+"""Control in discrete time, with efforts held between samples."""
 
 import dataclasses
 from collections.abc import Callable
@@ -34,16 +34,15 @@ def step(
 ) -> State:
     """Computes the state after a time `dt` under constant efforts `tau`.
 
-    This is the transition of a discrete-time model, for reinforcement learning and
-    predictive control: pure, batched by `jax.vmap`, differentiable in everything.
+    The function is pure, batched by `jax.vmap`, and differentiable in everything.
 
     **Arguments:**
 
     - `linkage`, `state`: the arm, and its joint positions and velocities.
     - `tau`: joint efforts, (n,) [N or N m]; `dt`: how long they are held [s].
-    - `forces`: other force elements, without states of their own; `t`: the time at the
-      start, which the elements receive [s].
-    - `options`: keywords of `simulate`.
+    - `forces`: other force elements, without states of their own; `t`: their time at
+      the start [s].
+    - `options`: keywords of `simulate`; `throw` is False by default.
 
     **Returns:** the `State` at the end; NaN if the solve failed.
 
@@ -65,11 +64,9 @@ def step(
 
 
 class _Delay(NamedTuple):
-    """A delay in periods.
+    """A delay in whole periods, at most `most`, and the rest.
 
-    - `whole`: number of whole periods, an array where the delay is traced; at most
-      `most`.
-    - `rest`: time beyond them [s]; None if it is known to be 0.
+    - `whole`: their number, an array if traced; `rest`: time beyond [s], None if 0.
     """
 
     whole: Array | int
@@ -78,7 +75,7 @@ class _Delay(NamedTuple):
 
 
 def _in_periods(delay: Any, period: Any, samples: int) -> _Delay:
-    """Splits a delay into periods of a motion of so many samples."""
+    """Splits a delay into periods, in a motion of so many samples."""
     traced = is_traced(delay, period)
     xp: Any = jnp if traced else np
     delay, period = xp.asarray(delay, float), xp.asarray(period, float)
@@ -95,7 +92,7 @@ def _in_periods(delay: Any, period: Any, samples: int) -> _Delay:
 
 
 def _noise(spread: State, key: Any, samples: int) -> Any:
-    """Draws what is added to the measured state, a row per sample."""
+    """Draws noise of the measured state, a row per sample."""
 
     def drawn(key):
         keys = State(*jax.random.split(key))
@@ -123,27 +120,25 @@ def simulate_sampled(
 
     **Arguments:**
 
-    - `linkage`, `state0`: the arm, and its joint positions and velocities.
+    - `linkage`, `state0`, `forces`: as in `simulate`; `t0`: time of the first sample
+      [s].
     - `control`: a force element such as a `PDController`, whose effort is held until
       the next sample. A state, such as a `PIDController`'s, takes one Euler step per
       sample.
-    - `period`: time between samples [s]; `samples`: number of samples.
-    - `forces`: other force elements.
-    - `t0`: time of the first sample [s].
+    - `period`: time between samples [s]; `samples`: their number.
     - `delay`: time from measurement to action [s], possibly longer than a period. The
-      effort is zero until the first command acts. As a function of the delay, the
-      motion has a kink at each whole number of periods; derivatives there are those of
-      longer delays. Each number of whole periods compiles its own program; all traced
-      delays share one. A traced delay below 0 ends the motion as not finite.
+      effort is zero until the first command acts. At whole numbers of periods,
+      derivatives are those of longer delays. Each number of whole periods compiles its
+      own program; all traced delays share one. A traced delay below 0 ends the motion
+      as not finite.
     - `noise`: standard deviations of the measured positions and velocities (each (n,)
       or one for all), with a `jax.random` `key`.
-    - `options`: keywords of `simulate`; by default `max_steps` is 65536 and 64 more per
+    - `options`: keywords of `simulate`; `max_steps` is by default 65536 and 64 more per
       sample.
 
-    **Returns:** a `Solution` at the sampling times, the end included, with `tau`. For
-    pictures, tables, `joint_efforts` and `joint_reactions`, its `forces` are
-    `(control, *forces)`, the controller first. The controller's efforts are then those
-    that act: 0 before the first command arrives.
+    **Returns:** a `Solution` at the sampling times and the end, with `tau` and
+    `acting`. For pictures, tables, `joint_efforts` and `joint_reactions`, its `forces`
+    are `(control, *forces)`.
 
     **Raises:** ValueError for malformed arguments; RuntimeError for a failed solve,
     unless `throw=False`.

@@ -18,10 +18,10 @@ from ..steps.landing import Clock
 class SampleState(NamedTuple):
     """The state of a controller between its samples.
 
-    - `taken`: number of samples up to here.
-    - `memory`: the controller's own state.
+    - `taken`: number of samples so far; `memory`: the controller's own state.
     - `command` (n,): the last one; `acting` (n,): the one that acts [N or N m].
-    - `under_way` (command, n): the last ones in a ring, None if each acts at once.
+    - `under_way` (command, n): the last ones in a ring; None if delays are below a
+      period.
     - `arrived`: how many began to act between samples; None if they act at samples.
     """
 
@@ -40,7 +40,7 @@ class ClockElement(Element):
 
     @property
     def jump_ts(self) -> None:
-        """None: its clock says when, and a controller's own times do not matter."""
+        """None: `clock` has the times; a controller's own do not matter."""
 
     def __call__(self, t: Array, q: Array, qd: Array, linkage: Linkage) -> Array:
         return jnp.zeros_like(q)
@@ -53,13 +53,11 @@ class Arrivals(ClockElement):
 class Sampler(ClockElement):
     """A controller that samples once per period, as an element.
 
-    Its efforts are those of `Args.sampled`.
-
-    - `control`: the controller. `clock`: that of the samples.
-    - `noise`: what is added to the measured state, a row per sample; or None.
-    - `late`: how many periods a command comes late; at most `most`.
-    - `rest`: how long beyond these [s]; the element before is then `Arrivals`. None if
-      commands begin to act at samples.
+    - `control`: the controller; `clock`: that of the samples.
+    - `noise`: that of the measured state, a row per sample; or None.
+    - `late`: delay of a command in periods, at most `most`; `rest`: delay beyond these
+      [s], None if commands begin to act at samples. Otherwise the element before is
+      `Arrivals`.
     """
 
     control: Element
@@ -69,7 +67,6 @@ class Sampler(ClockElement):
     most: int = eqx.field(static=True)
 
     def unsampled(self, linkage: Linkage) -> SampleState:
-        """Returns what holds before the first sample."""
         memory = self.control.initial_state(linkage)
         none, tau = jnp.zeros((), int), jnp.zeros(joints_of(linkage))
         before = SampleState(
@@ -88,7 +85,6 @@ class Sampler(ClockElement):
     def sampled(
         self, q: Array, qd: Array, linkage: Linkage, before: SampleState
     ) -> SampleState:
-        """Returns what holds after a sample."""
         k, under_way = before.taken, before.under_way
         if self.noise is not None:
             q, qd = (value + rows[k] for value, rows in zip((q, qd), self.noise))
@@ -118,7 +114,6 @@ class Sampler(ClockElement):
 
 
 def sampler_of(forces: Forces) -> Sampler | None:
-    """Returns the controller in discrete time, or None."""
     found = [element for element in forces if isinstance(element, Sampler)]
     return found[0] if found else None
 
@@ -133,10 +128,7 @@ def after_samples(
     sampler: Sampler, clocks: tuple[Array, Array], q: Array, qd: Array,
     linkage: Linkage, before: SampleState,
 ) -> tuple[SampleState, Truth]:  # fmt: skip
-    """Returns what holds after what happens at a time, and whether anything does.
-
-    `clocks`: the time by those of arrivals and of samples.
-    """
+    """Returns what holds after samples and arrivals at a time, and whether any came."""
     of_arrivals, of_samples = clocks
     clock: Any = sampler.clock
     time = clock.at(before.taken)

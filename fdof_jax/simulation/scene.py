@@ -1,4 +1,4 @@
-"""Scenes: a linkage, its initial state, its forces and its end time."""
+"""Scenes, and functions that accept them."""
 
 import functools
 import inspect
@@ -19,7 +19,6 @@ class Scene(NamedTuple):
     `simulate`, `sweep`, `joint_efforts`, `joint_reactions` and `linearize` accept a
     scene in place of its parts.
 
-    - `linkage`, `state0`, `forces`: the arguments of `simulate`.
     - `t1`: end time [s]; a scene starts at 0.
 
     >>> import fdof_jax as fj
@@ -39,7 +38,7 @@ _Result = TypeVar("_Result", covariant=True)
 
 
 class OfScene(Protocol[_Arguments, _Result]):
-    """A function of a linkage, forces and more, or of a scene and more."""
+    """A function that accepts a scene in place of its parts."""
 
     @overload
     def __call__(
@@ -92,5 +91,4 @@ def accepts_scene(
 
 
 def with_full_size(scene: Scene) -> Scene:
-    """Returns the scene with forces of full size."""
     return scene._replace(forces=elements_on(scene.linkage, scene.forces))

@@ -1,4 +1,4 @@
-"""Simulates motions of a linkage: the door, with its checks."""
+"""Simulates motions of a linkage, after checks of all arguments."""
 
 from collections.abc import Callable, Sequence
 
@@ -102,10 +102,7 @@ def solve_options(
 
 
 def elements_at_door(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
-    """Returns forces as elements; their values are not looked at.
-
-    Raises ValueError for other shapes and kinds, and warns of single precision.
-    """
+    """Returns forces as elements; refuses wrong shapes and kinds, but no values."""
     adapted = elements_on(linkage, forces)
     for index, element in enumerate(adapted):
         place = f"forces[{index}]"
@@ -116,7 +113,7 @@ def elements_at_door(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
 
 
 def check_elements(forces: Forces, linkage: Linkage, ts: Array) -> None:
-    """Raises ValueError for known values of elements, and elements that do not fit."""
+    """Raises ValueError for elements whose known values are wrong or do not fit."""
     for index, element in enumerate(elements_at_door(linkage, forces)):
         place = f"forces[{index}]"
         if is_traced(linkage, ts, element):
@@ -175,35 +172,31 @@ def simulate(
 ) -> Solution:
     """Computes the motion of a linkage from `state0` at `ts[0]`, at the times `ts`.
 
-    The equations of motion are the paper's masked equations (17)-(27), reduced.
-    `simulate` is a pure function, differentiable in every array and batched by
-    `jax.vmap`. One compilation serves all topologies.
+    It solves the paper's masked equations (17)-(27), reduced. `simulate` is pure,
+    differentiable in every array and batched by `jax.vmap`.
 
     **Arguments:**
 
-    - `linkage`, `state0`: the arm, and its joint positions and velocities. A
-      `Scene` may stand for linkage, state0 and forces: `simulate(scene, ts)`.
+    - `linkage`, `state0`: the arm, and its joint positions and velocities. A `Scene`
+      may stand for linkage, state0 and forces: `simulate(scene, ts)`.
     - `ts`: increasing output times, of shape (time,) [s]. A step ends at the last time.
       States before it are interpolated and may be hundreds of times less exact;
       `diffrax.ClipStepSizeController` makes steps end at all of `ts`.
     - `forces`: a tuple of force elements `(t, q, qd, linkage) -> tau`.
-    - `until`: a condition that ends the motion before `ts[-1]`, or a tuple of several.
-      A function `(t, q, qd, linkage) -> number` ends it where the number passes 0; a
-      `simulation.Until` adds the direction. `Solution.end` is exact and has
-      derivatives.
-    - `own0`: initial states of the `StatefulElement`s among the forces, one row of a
-      `Solution.own`; by default each element's `initial_state`.
+    - `until`: one or several conditions that end the motion before `ts[-1]`: functions
+      `(t, q, qd, linkage) -> number` that pass 0, or a `simulation.Until` with a
+      direction. `Solution.end` is exact and has derivatives.
+    - `own0`: initial states of the `StatefulElement`s, like a row of `Solution.own`; by
+      default each element's `initial_state`.
     - `rtol`, `atol`: relative and absolute tolerance of a step, by default 1e-11 in
-      float64 and 1e-5 in float32; not allowed with a `stepsize_controller`.
+      float64 and 1e-5 in float32.
     - `max_step`: longest step [s], by default unlimited. Set it for efforts so brief
-      that adaptive steps would pass over them. Not allowed with a
-      `stepsize_controller`, which has its own (`dtmax`).
+      that steps would pass over them.
     - `solver`, `stepsize_controller`, `dt0`, `adjoint`, `max_steps`, `throw`,
-      `progress_meter`: as in `diffrax.diffeqsolve`. The default solver and controller,
-      also selected by `None`, are Dopri8 and adaptive steps. The first step `dt0` is
-      1 ms, because estimates of it fail from exact rest; `None` lets the controller
-      estimate it. Reverse mode works with the default `adjoint`; for forward mode pass
-      `diffrax.ForwardMode()`.
+      `progress_meter`: as in `diffrax.diffeqsolve`. None selects Dopri8 and adaptive
+      steps. A controller excludes `rtol`, `atol` and `max_step`. `dt0` is 1 ms; with
+      `None` the controller estimates it, which fails from exact rest. Reverse mode
+      works with the default `adjoint`, forward mode with `diffrax.ForwardMode()`.
 
     **Returns:** a `Solution`. With `throw=False` its `result` reports a failed solve,
     and states that were not reached are NaN.

@@ -59,7 +59,7 @@ def flags(words: Iterable[str]) -> dict[str, list[int] | str]:
 
 
 def attributes_in(unit: str) -> dict[str, dict[str, Any]]:
-    """Returns names and units of a solution's arrays; `unit`: of the joints."""
+    """Returns names and units of a solution's arrays, from the joints' unit."""
     named = lambda name, unit: {"long_name": name, "units": unit}
     return {
         "q": named("joint position", unit),
@@ -72,7 +72,7 @@ def attributes_in(unit: str) -> dict[str, dict[str, Any]]:
 
 
 def outcome_numbers(result: diffrax.RESULTS) -> Array | np.ndarray:
-    """Returns the places of results in `OUTCOMES`, by NumPy unless they are traced."""
+    """Returns the places of results in `OUTCOMES`, in NumPy unless traced."""
     results = diffrax.RESULTS
     ordered = (
         results.successful, results.singular, results.nonfinite,
@@ -87,12 +87,10 @@ class Events(eqx.Module):
     """The last 64 events of joints that elements hold: when, where and what.
 
     - `t`: times [s]; `joint`: numbers of joints, from 1, or 0 for a reset of the state;
-      `kind`: codes of the words in `table`. Each has an entry per event, NaN beyond the
-      last one.
-    - `count`: how many there were in all, a whole number kept as a float.
-    - `table`: a dictionary of columns, "t [s]", "joint" and "event". An event is one
-      of: sticks, slips, bounces, rests on its stop, leaves its stop, is braked, is let
-      go, is stopped, is reset.
+      `kind`: codes of the words in `table`. All are NaN beyond the last event.
+    - `count`: number of all events, as a float.
+    - `table`: the events as columns. An event is one of: sticks, slips, bounces, rests
+      on its stop, leaves its stop, is braked, is let go, is stopped, is reset.
     """
 
     t: Float[Array, " event"]
@@ -102,7 +100,7 @@ class Events(eqx.Module):
 
     @property
     def table(self) -> dict[str, np.ndarray]:
-        """The events as columns, for instance for `pandas.DataFrame`.
+        """A dictionary of the columns "t [s]", "joint" and "event".
 
         For a batch, the first column, "motion", is the motion's place in it.
         """
@@ -114,7 +112,6 @@ class Events(eqx.Module):
         return dict(zip(("motion",), batch)) | columns
 
     def __repr__(self) -> str:
-        """The first events of one motion, or shapes."""
         if is_traced(self.count) or np.ndim(self.count):
             return super().__repr__()
         rows = zip(*self.table.values())
@@ -131,46 +128,43 @@ class Solution(eqx.Module):
 
     - `ts`: output times [s].
     - `q`, `qd`: joint positions [m or rad] and velocities at `ts`; NaN after a failure.
-      A printed motion reports positions so large that their rounding exceeds the
-      default tolerance, such as angles that grow without end.
-    - `stats`: diffrax's statistics, such as `num_steps`, and `time_reached` [s].
-      Adaptive steps add `accuracy`: the rounding unit, 2.2e-16 in float64, over the
+    - `stats`: diffrax's statistics, such as `num_steps`, `time_reached` [s], and those
+      below.
+    - `result`: diffrax's result, one per trajectory; `outcome` states it in words.
+    - `own`: states of the `StatefulElement`s, in the order of the forces, each like its
+      `initial_state` with a leading time axis.
+
+    In `stats`:
+
+    - `accuracy`, of adaptive steps: the rounding unit (2.2e-16 in float64) over the
       least of the `inertia_ratios` at the steps. Relative errors of accelerations are
-      of this order, but it is no bound: they may be several times as large, and larger
-      still in joints that accelerate less than others or where efforts cancel. Steps do
-      not chase errors below it. Elements that switch add `num_switches` and
-      `slowest_crossing`: the least speed at which a switching function passed its zero,
-      relative to the function's size in the step, or to the speed at which the function
-      would turn back at its size. A function that turns back within 1 % of its size
-      before its zero counts as if it had gone as far beyond. Near 0 a contact grazes,
-      and the motion has no derivative. Efforts that jump at switches add `one_sided`:
-      the number of places where derivatives may hold on one side only, because the
-      motion starts on a switch or meets two at once.
-    - `result`: diffrax's result, one per trajectory: `diffrax.RESULTS.successful` or
-      the reason for the failure. `outcome` states it in words.
-    - `own`: the states of the `StatefulElement`s at `ts`, in the order of the forces;
-      each like its `initial_state`, with a leading time axis.
+      of this order, and larger in joints that accelerate less than others or where
+      efforts cancel. Steps do not chase errors below it.
+    - `num_switches`, with elements that switch, and `slowest_crossing`: the least speed
+      at which a switching function passed its zero, relative to its size in the step,
+      or to the speed at which it would turn back at its size. Near 0 a contact grazes,
+      and the motion has no derivative.
+    - `one_sided`, if efforts jump at switches: the number of places where derivatives
+      may hold on one side only, because the motion starts on a switch or meets two at
+      once.
 
     With elements that hold joints (`JointFriction`, `HardStops`, `Brake`), a `Payload`
     or a `Reset`, else None (the first `qd` are then those after blows at the start):
 
     - `modes`: what holds each joint at `ts`: 0 nothing, 1 friction, 2 its lower stop, 3
-      its upper stop, 4 a brake. At the very time of an event it may be the mode before
-      or after the event.
-    - `taken`: energy taken by friction, blows, brakes, resets and the catching of
-      payloads up to `ts` [J]. Friction whose level is a function is not counted.
-    - `events`: what happened to which joint, and when. The times have derivatives.
+      its upper stop, 4 a brake. At an event it is the mode before or after it.
+    - `taken`: energy taken up to `ts` by friction, blows, brakes, resets and the
+      catching of payloads [J]. Friction whose level is a function is not counted.
+    - `events`: the `Events`, whose times have derivatives.
 
-    - `end`: with `until`, else None: the time `end.t` and the state `end.q`, `end.qd`
-      at which the motion ended, and the number `end.condition` of the condition that
-      was met first. If none was met, `ended` is False, the number is -1 and the end is
-      the last row. Rows after the end are NaN.
+    With `until`, else None:
+
+    - `end`: the `End` of the motion. Rows after it are NaN.
 
     After `simulate_sampled`, else None:
 
     - `tau`: efforts commanded at each sample (samples, n), 0 at fixed pairs [N or N m].
-      Each acts from its sample plus the delay until the next one acts.
-    - `acting`: efforts that act at `ts`, or begin to act there [N or N m].
+    - `acting`: efforts that act, or begin to act, at `ts` [N or N m].
 
     >>> import fdof_jax as fj
     >>> import numpy as np
@@ -211,18 +205,17 @@ class Solution(eqx.Module):
     def outcome(self) -> np.ndarray:
         """Outcome of each trajectory in words, an array of the batch's shape.
 
-        - `"successful"`, or `"ended"`: successful, up to a condition of `until`.
-        - `"ill-conditioned"`: the mass matrix is singular or nearly so (see
+        - `"successful"`; `"ended"`: successful, up to a condition of `until`.
+        - `"ill-conditioned"`: the mass matrix is nearly singular (see
           `inertia_ratios`).
-        - `"not finite"`: the accelerations are not finite, for instance with a negative
-          mass or a reference out of reach (see `references.reach_margin`).
-        - `"out of steps"`, or `"solver failed"`.
-        - `"tolerance out of reach"`: rounding keeps even the shortest step from meeting
-          it.
-        - `"too many switches"`: endless ones, as between branches that push towards
-          each other.
+        - `"not finite"`: the accelerations are not finite, for instance if a reference
+          is out of reach (see `references.reach_margin`).
+        - `"out of steps"`; `"solver failed"`.
+        - `"tolerance out of reach"`: even the shortest step misses it, because of
+          rounding or of an effort that jumps.
+        - `"too many switches"`: endless, as of branches that push towards each other.
 
-        Raises ValueError under JAX's transformations, where `result` has no words yet.
+        **Raises:** ValueError under JAX's transformations.
         """
         if is_traced(self.result):
             raise ValueError(
@@ -233,7 +226,6 @@ class Solution(eqx.Module):
         return words if self.end is None else np.where(self.ended, "ended", words)
 
     def __repr__(self) -> str:
-        """Summarises the motion in words; traced values show only their shape."""
         facts = "; ".join(f"{name}: {value}" for name, value in self._facts().items())
         return f"{type(self).__name__}({facts})" if facts else super().__repr__()
 
@@ -242,7 +234,7 @@ class Solution(eqx.Module):
         return html_table(facts.items()) if facts else None
 
     def _facts(self) -> dict[str, str]:
-        """Returns the known facts; none if the leaves are not arrays of a motion."""
+        """Returns the known facts; none without arrays of a motion."""
         if len(np.shape(self.q)) < 2:
             return {}
         *batch, count, _ = self.q.shape
@@ -288,7 +280,7 @@ def _span(numbers: ArrayLike) -> str:
 
 
 def _remark_on_resolution(q: np.ndarray) -> str | None:
-    """Returns how far positions are resolved, if less than the default tolerance."""
+    """Returns how far positions are resolved, if less than by default."""
     largest = np.max(np.abs(q), initial=0, where=np.isfinite(q))
     step = np.spacing(largest)
     if step <= (TOLERANCE if q.dtype == np.float64 else SINGLE_TOLERANCE):
@@ -297,7 +289,6 @@ def _remark_on_resolution(q: np.ndarray) -> str | None:
 
 
 def _remarks_on_derivatives(stats: Statistics) -> list[str]:
-    """Returns what the statistics of one or more motions say about derivatives."""
     words = []
     if np.min(stats.get("slowest_crossing", np.inf)) < SLOW:
         words.append(

@@ -51,10 +51,7 @@ def solve(inputs: Inputs, keywords: Settings) -> tuple[Solution, bool | None]:
 
 
 def padded(rows: PyTree) -> PyTree:
-    """Returns arrays (time, ...) with their last row repeated up to a power of two.
-
-    Few programs then serve all numbers of output times.
-    """
+    """Returns arrays (time, ...) with their last row repeated up to a power of two."""
 
     def longer(row: ArrayLike) -> np.ndarray:
         array = np.asarray(row)
@@ -74,7 +71,7 @@ def cut(rows: PyTree, count: int) -> PyTree:
 
 @jax.transfer_guard("allow")  # the padded times are in NumPy
 def _solve_one(inputs: Inputs, keywords: Settings) -> tuple[Solution, bool] | None:
-    """Computes the motion of one arm from concrete inputs, and whether it succeeded.
+    """Computes a motion from concrete inputs, and whether it succeeded.
 
     Returns None if a force element holds a traced value.
     """
@@ -144,10 +141,10 @@ _without_functions = eqx.filter_jit(
 
 @eqx.filter_custom_vjp
 def _integrate_reversibly(inputs: Inputs, keywords) -> Solution:
-    """Integrates a motion that may be differentiated by `jax.grad`.
+    """Integrates a motion that `jax.grad` may differentiate.
 
-    Unrolled stages compile differently with and without derivatives, and the replay of
-    the backward pass must reproduce the same bits: they serve the plain solve alone.
+    Unrolled stages serve the plain solve alone, because they compile differently with
+    derivatives: the backward pass must reproduce the same bits.
     """
     # The plain solve needs no loops for reverse mode, which take longer to compile.
     keywords = keywords | {"adjoint": diffrax.ForwardMode()}
@@ -164,9 +161,9 @@ _FEW = 12
 
 
 def _few(moving, adjoint) -> bool:
-    """Returns whether tangents in all these numbers serve better than the adjoint.
+    """Returns whether tangents in these numbers serve better than the adjoint.
 
-    Who sets the number of checkpoints wants the adjoint.
+    A given number of checkpoints asks for the adjoint.
     """
     leaves = jax.tree.leaves(moving)
     real = all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves)

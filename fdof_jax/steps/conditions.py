@@ -1,7 +1,6 @@
 """The very zeros of conditions: where resets act, and runs end.
 
-Steps end close to a zero. Switches need no more, but a reset that acts beside its zero,
-and the time of an end, would be off by that.
+Steps end close to a zero, which is enough for switches alone.
 """
 
 import jax
@@ -18,15 +17,14 @@ _NEWTON, _CONVERGED = 3, 0.01
 
 
 def places_of(conditions: tuple[tuple[int, int], ...]) -> Array:
-    """Returns the places of conditions (place, direction) among the functions."""
     return jnp.array([place for place, _ in conditions])
 
 
 def met(conditions: tuple[tuple[int, int], ...], passed: Array, after: Array) -> Array:
     """Returns which conditions (place, direction) are met, (condition,).
 
-    `passed`: which functions passed a zero; `after`: all sides then. A direction of 0
-    stands for both.
+    `passed`: which functions passed a zero; `after`: all sides then. Direction 0 stands
+    for both.
     """
     places = places_of(conditions)
     wanted = jnp.array([direction for _, direction in conditions])
@@ -36,10 +34,10 @@ def met(conditions: tuple[tuple[int, int], ...], passed: Array, after: Array) ->
 def at_zero(
     term: Term, t: Array, y: Integrated, args: Arguments, which: Array, near: Array
 ) -> tuple[Array, Integrated]:
-    """Returns time and state at the zero of a function, if the state is near it.
+    """Returns time and state at the zero of a function, by Newton's method.
 
-    Else those given, also if there is none, as of what turns back close to it. By
-    Newton's method, to rounding and to second derivatives.
+    They are right to rounding and to second derivatives. Without a zero nearby they are
+    those given.
     """
 
     def function(time):
@@ -72,11 +70,10 @@ def sides_after(
     term: Term, places: Array, t: Array, before: tuple[Integrated, Arguments],
     after: tuple[Integrated, Arguments], sizes: Array,
 ) -> Array:  # fmt: skip
-    """Returns the sides of functions after a reset; of one that is 0, where it goes.
+    """Returns the sides of functions after a reset.
 
-    It goes on unless the reset turns its rate round, or stops it: then it is to be
-    reset again. `places`: of these functions; `before`, `after`: states and arguments
-    at the time of the reset; `sizes`: see `Switches`.
+    A function that is 0 goes on, unless the reset turns its rate round or stops it:
+    then it is reset again. `before`, `after`: states and arguments at the reset.
     """
 
     def at(state: tuple[Integrated, Arguments]) -> tuple[Array, Array]:

@@ -1,8 +1,7 @@
 """Step control of derivatives: their errors count beside those of the motion.
 
-A motion that rests has no error, however long a step is, but its derivatives have one.
-Where the tangents are known, `TangentJudge` judges them. Where they are not, because
-the caller differentiates or the adjoint follows, `ProbeJudge` judges a probe.
+A motion at rest has no error, but its derivatives have. `TangentJudge` judges tangents;
+where these are unknown, `ProbeJudge` judges a probe.
 """
 
 from typing import NamedTuple
@@ -46,11 +45,10 @@ def _error_of_tangents(
     error: PyTree, ends: PyTree, integrated: PyTree, tolerance: Array, noise: Array,
     least: Array,
 ) -> Array:  # fmt: skip
-    """Returns the largest error of a tangent over what its tolerance allows.
+    """Returns the largest error of a tangent over its tolerance, 0 without tangents.
 
-    Without tangents this is 0. They must be those along one axis, `TANGENTS`.
-    `ends`, `integrated`: the state at both ends of a step, with positions and, as it is
-    integrated, with displacements. `least`: see `_LEAST`.
+    The tangents are those along `TANGENTS`. `ends`, `integrated`: both ends of a step,
+    in positions and in displacements. `least`: see `_LEAST`.
     """
     return jnp.zeros_like(tolerance)
 
@@ -72,8 +70,6 @@ def _(primals, tangents):
 
 
 class StepEnds(NamedTuple):
-    """A step, with the integrated state at both ends and the arguments in it."""
-
     t0: Array
     t1: Array
     y0: Integrated
@@ -85,7 +81,7 @@ class TangentJudge(eqx.Module):
     """Judges tangents of the motion; all of them take the same steps.
 
     `tolerance`: relative to the largest tangent, however small others are. None: each
-    has a tolerance of its own, which follows from that of the motion.
+    has its own, from that of the motion.
     """
 
     tolerance: float | None = None
@@ -96,10 +92,7 @@ class TangentJudge(eqx.Module):
     def __call__(
         self, step: StepEnds, estimate: Estimate, probe: tuple[()], rtol: Array | float
     ) -> tuple[Array, tuple[()]]:
-        """Returns the largest error of a tangent over its tolerance, and no probe.
-
-        `rtol`: the relative tolerance of the motion.
-        """
+        """Returns the largest error of a tangent over its tolerance, and no probe."""
         noise = _noise(estimate.health)
         tolerance, least = self.tolerance, _ANY
         if tolerance is None:
@@ -117,10 +110,7 @@ class TangentJudge(eqx.Module):
 def linearised(
     term: ScheduledTerm, t: Array, y: Integrated, args: Arguments, scheduled: PyTree
 ) -> Array:
-    """Returns the derivative of the rates in the state's numbers, a square matrix.
-
-    `scheduled`: what depends on time alone, at `t`.
-    """
+    """Returns the Jacobian of the rates in the state's numbers."""
     numbers, state_of = ravel_pytree(y)
     rates = lambda numbers: term.vector_field(t, state_of(numbers), args, scheduled)
     return jax.jacfwd(lambda numbers: ravel_pytree(rates(numbers))[0])(numbers)
@@ -129,16 +119,14 @@ def linearised(
 class ProbeJudge(eqx.Module):
     """Judges a step by what it does to the linearised motion.
 
-    A probe stands for all tangents. It moves like a tangent, with the linearisation at
-    the end of a step held for the whole step. A jump replaces it by a new one. This
-    costs one linearisation of the rates a step.
+    A probe stands for all tangents. It moves like one, with the linearisation at the
+    end of a step held for the whole step. A jump replaces it.
     """
 
     term: ScheduledTerm
     tableau: diffrax.ButcherTableau = eqx.field(static=True)
 
     def start(self, y0: Integrated) -> Array:
-        """Returns a new probe."""
         numbers, _ = ravel_pytree(y0)
         probe = np.random.default_rng(0).standard_normal(numbers.size)
         return jnp.asarray(probe, numbers.dtype)
@@ -166,9 +154,9 @@ class ProbeJudge(eqx.Module):
         return ratio, jnp.where(new, self.start(y1), end)
 
     def _step(self, matrix: Array, probe: Array) -> tuple[Array, Array]:
-        """Returns the change of y' = A y in a step of length h from y, and its error.
+        """Returns the change of y' = A y in a step of length h, and its error.
 
-        `matrix` is h A, and `probe` is y.
+        `matrix` is h A, and `probe` is y at the start.
         """
         count, size = len(self.tableau.b_sol), len(probe)
         implicit = self.tableau.a_diagonal is not None

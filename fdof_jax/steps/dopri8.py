@@ -1,8 +1,4 @@
-"""Dormand and Prince's method of order 8(7): the common parts of its two solvers.
-
-`LoopedDopri8` compiles faster and `UnrolledDopri8` runs faster in large batches. Both
-agree with `diffrax.Dopri8` up to rounding.
-"""
+"""Dormand and Prince's method of order 8(7): the common parts of its two solvers."""
 
 from abc import abstractmethod
 from typing import Any, ClassVar, NamedTuple
@@ -40,7 +36,7 @@ DENSE = _INTERPOLATION.eval_coeffs  # (stage, power), highest first
 
 
 class ScheduledDopri8(diffrax.AbstractAdaptiveSolver):
-    """Base of both solvers: the kind of their terms, and their order."""
+    """Base of both solvers."""
 
     term_structure: ClassVar = ScheduledTerm
     tableau: ClassVar = TABLEAU
@@ -93,10 +89,9 @@ class DenseOutput(diffrax.AbstractLocalInterpolation):
 
 
 class Estimate(NamedTuple):
-    """The error of a step as controllers get it, and what is known of its end.
+    """The error of a step for controllers, and what is known of its end.
 
-    - `health`: the `Health` there, 1 if that is bad.
-    - `scheduled`: what depends on time alone there, None where that is not known.
+    - `health`: there, 1 if bad; `scheduled`: what depends on time alone, or None.
     """
 
     error: PyTree
@@ -105,16 +100,14 @@ class Estimate(NamedTuple):
 
 
 def scheduled_at_end(schedule: PyTree) -> PyTree:
-    """Returns the row of a step's schedule for its `Estimate`."""
     return jax.tree.map(lambda rows: rows[AT_END], schedule)
 
 
 def verdict(estimate: Estimate, h: Array) -> tuple[Estimate, diffrax.RESULTS]:
-    """Returns an estimate, its error and health replaced if that is bad, and a result.
+    """Returns an estimate, with its error and health replaced if bad, and a result.
 
-    The health is NaN for a step that is not finite, and 0 for a singular one. An
-    infinite error rejects the step until it is short. Results of rejected steps are
-    ignored, so the short step is accepted, with error 0.
+    An infinite error rejects a step that is singular or not finite until it is short.
+    The short one is accepted, with error 0, as results of rejected steps are ignored.
     """
     error, health, scheduled = estimate
     singular, short = is_singular(health), jnp.abs(h) < SHORTEST[h.dtype]

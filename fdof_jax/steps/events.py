@@ -1,7 +1,7 @@
 """Switches of elements between the branches of their formulas, and the jumps there.
 
-Within a step the branches are those in force at its start, so the step's equations are
-smooth. A step over the zero of a switching function is replaced by one that ends there.
+Within a step the branches are fixed, so its equations are smooth. A step over a switch
+is replaced by one that ends there.
 """
 
 from typing import Any, NamedTuple
@@ -36,24 +36,21 @@ _BRIEF = 10
 class Switches(NamedTuple):
     """The state of the switching functions where a step ended.
 
-    - `sides` (switch,): those in force in this step: 1 above and -1 below zero, and 0
-      before the start.
+    - `sides` (switch,): those in this step: 1 above and -1 below zero, 0 before the
+      start.
     - `after`: those after a switch here.
-    - `until`: when the step should have ended; its end if nothing switched before [s].
-    - `near`: how far from its zero a switching function may switch [s].
-    - `sizes` (switch,): the largest values of the switching functions up to here.
-    - `length`: that of the step [s].
+    - `until`, `near`: see `Found`.
+    - `sizes` (switch,): the largest values so far.
     - `early`: whether a function that switches here has not quite reached its zero.
-    - `passed`: number of switches up to here.
-    - `one_sided`: number of places up to here where derivatives may hold on one side
-      only (see `Events`); None if nothing jumps at switches.
-    - `grazing`, `grazing_here`: how nearly the crossings so far grazed, and the one
-      here; 0 if none (see `Passage`).
-    - `modes`: those of the joints (see `ScheduledTerm`), None if elements hold none.
-    - `late`: 0, whose derivatives are those of the time of the event at the beginning
-      of this step; None without modes.
-    - `resets` (reset,): which resets are met here, None without any.
-    - `ended`: which condition ended the run here, -1 if none did; None without any.
+    - `passed`: number of switches so far.
+    - `one_sided`: number of places so far with one-sided derivatives (see `Events`);
+      None if nothing jumps at switches.
+    - `grazing`, `grazing_here`: how nearly crossings grazed so far, and here; 0 if
+      none.
+    - `late`: 0, with the derivatives of the time of the event where this step began;
+      None without modes.
+    - `resets` (reset,): which are met here; `ended`: which condition ended the run, -1
+      if none did. Each is None without any.
     """
 
     sides: Array
@@ -74,7 +71,6 @@ class Switches(NamedTuple):
 
     @property
     def facts(self) -> dict[str, Array]:
-        """The statistics of a run that ended here."""
         sided = {} if self.one_sided is None else {"one_sided": self.one_sided}
         grazing = self.grazing
         if self.ended is not None:
@@ -88,12 +84,10 @@ class Switches(NamedTuple):
 class Regime(NamedTuple):
     """The branches and modes in a step, and what has changed at its beginning.
 
-    - `sides`, `modes`: those in force.
     - `changed` (switch,): which functions switched there; `on_zero`: which begin near
       their zeros, as after a switch.
-    - `sizes`: their largest values before, 0 of functions that are new.
-    - `grazing`: how nearly crossings grazed, the one there included.
-    - `late`: see `Switches`.
+    - `sizes`: their largest values before, 0 of new functions.
+    - `grazing`, `late`: see `Switches`.
     """
 
     sides: Array
@@ -108,14 +102,14 @@ class Regime(NamedTuple):
 class Events(eqx.Module):
     """Events between the steps of a run.
 
-    Where efforts jump at a switch, a motion that starts on it, or meets it together
-    with another, may have different derivatives on its two sides.
+    Where efforts jump, derivatives may hold on one side only if a motion starts on a
+    switch or meets two at once.
 
     - `jumping`: whether efforts jump where each function switches; None of conditions.
       The last `guards` functions guard modes.
-    - `resets`, `ends`: of the conditions that reset the state, and that end the run,
-      the places among the functions, and directions: 0 for both.
-    - `derivatives`: whether states move with the times of events, in derivatives.
+    - `resets`, `ends`: (place, direction) of the conditions that reset the state, and
+      that end the run; 0 stands for both directions.
+    - `derivatives`: whether states get those of the times of events.
     """
 
     term: Any
@@ -127,7 +121,6 @@ class Events(eqx.Module):
     derivatives: bool = eqx.field(static=True)
 
     def start(self, t0: Array, args: Arguments) -> Switches:
-        """Returns the state before the first step."""
         modes = self.term.unknown_modes(args)[0] if self.guards else None
         count, none = len(self.jumping), jnp.zeros_like(t0)
         unknown, no = jnp.zeros(count, t0.dtype), jnp.array(False)
@@ -157,8 +150,7 @@ class Events(eqx.Module):
     ) -> tuple[Integrated, Regime]:
         """Returns the state where a step begins, and what is in force in it.
 
-        `t`, `y`: before what happens there; `jumped`: whether something may. `args`: of
-        all but sides and modes.
+        `t`, `y`: before what happens there; `jumped`: whether something may.
         """
         if_jumped = lambda after, before: jnp.where(jumped, after, before)
         sides, modes, sizes = if_jumped(last.after, last.sides), last.modes, last.sizes
@@ -191,7 +183,7 @@ class Events(eqx.Module):
         """Returns state, modes and sides after an event, and `Switches.late`.
 
         The state moves on to the time of the event in the modes before, and back in
-        those after: but for resets, this changes nothing but derivatives.
+        those after. Except for resets, this changes nothing but derivatives.
         """
         before = args._replace(sides=last.sides, modes=last.modes)
         fired = changed[-self.guards :].reshape(-1, last.modes.mode.size)
@@ -260,10 +252,9 @@ class Events(eqx.Module):
     # What happens in a step?
 
     def held_still(self, regime: Regime, y1: Integrated, y0: Integrated) -> Integrated:
-        """Returns the end of a step, positions and rates of held joints as before.
+        """Returns the end of a step, with held joints as at its beginning.
 
-        Rounding errors of earlier steps, which the compensated sum carries, would still
-        move them.
+        Earlier rounding errors in the compensated sum would still move them.
         """
         if not self.guards:
             return y1
@@ -280,10 +271,7 @@ class Events(eqx.Module):
         self, t0: Array, t1: Array, path: diffrax.AbstractLocalInterpolation,
         own: Arguments, regime: Regime, last: Switches,
     ) -> tuple[Found, Switches]:  # fmt: skip
-        """Returns what a step found, and the state where it ended.
-
-        `own`: the arguments in the step.
-        """
+        """Returns what a step found, and the state where it ended."""
         sides, h = regime.sides, t1 - t0
         # Lengths of steps to a switch say nothing about the pace of the motion.
         share = jnp.finfo(t1.dtype).eps ** _NEAR
@@ -332,8 +320,7 @@ class Events(eqx.Module):
     def _ended(self, passed: Array, after: Array) -> Array | None:
         """Returns which condition ends the run in a step, see `Switches.ended`.
 
-        `passed`: which functions passed a zero on which they had not begun; `after`:
-        their sides then.
+        `passed`: which functions passed a zero on which they had not begun.
         """
         if not self.ends:
             return None
@@ -345,8 +332,7 @@ class Events(eqx.Module):
     ) -> tuple[Array, Integrated]:
         """Returns time and state at the zero of the condition that ended a run.
 
-        `t`, `y`: where the last step ended, close to it. Without such a condition, the
-        same.
+        Without such a condition, they are those given, of the last step's end.
         """
         args = args._replace(sides=last.sides, modes=last.modes)
         assert last.ended is not None
@@ -362,7 +348,6 @@ class Events(eqx.Module):
     def _one_sided(
         self, last: Switches, on_zero: Array, regime: Regime, sizes: Array
     ) -> Array | None:
-        """Returns `Switches.one_sided` at the end of a step."""
         if last.one_sided is None:
             return None
         jumping = np.array(self.jumping, bool)
@@ -379,7 +364,8 @@ def events_of(
 ) -> Events | None:  # fmt: skip
     """Returns the events of a run over the times `ts`, None if nothing switches.
 
-    `conditions`: whether each resets the state, else it ends the run; its direction.
+    `conditions`: whether each resets the state (else it ends the run), and its
+    direction.
     """
     guards = 0
     if term.unknown_modes is not None:

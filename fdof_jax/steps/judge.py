@@ -1,8 +1,7 @@
 """Judges steps: whether they are accurate, and how long the next one may be.
 
-It does not chase rounding errors. Equations that lose accuracy amplify them in the
-rates. The error estimate of a step is then this noise times the step size: no shorter
-step brings it below a tight tolerance, and steps that try reach nothing.
+It does not chase rounding errors: where equations lose accuracy, no shorter step meets
+a tight tolerance.
 """
 
 import functools
@@ -37,12 +36,7 @@ _HELD = 0.43
 
 
 class JudgeState(NamedTuple):
-    """The state of a judge.
-
-    - `controller`: that of diffrax's controller.
-    - `probe`: of derivatives (see `ProbeJudge`).
-    - `loss`: the largest loss of accuracy in steps so far.
-    """
+    """The states of the controller and the probe, and the largest loss so far."""
 
     controller: PyTree
     probe: PyTree
@@ -60,12 +54,12 @@ class Judge(eqx.Module):
     | Would derivatives be less accurate than the tolerance? | a larger error |
     | Is its error only rounding? | it counts as 0: shorter steps have it, too |
     | Is the error within the tolerance? | `controller` keeps or rejects the step |
-    | How much accuracy did it lose? | recorded, for `Solution.stats` |
+    | How much accuracy did it lose? | recorded |
 
     Up to the tolerance, a motion does not depend on where its steps end. So lengths of
-    steps are constants in derivatives, except where steps end at known times.
+    steps are constants in derivatives, except at known times.
 
-    - `watches`: whether this judge, not the method, checks the ends of steps.
+    - `watches`: whether this judge, not the method, checks ends of steps.
     """
 
     controller: Any
@@ -74,10 +68,7 @@ class Judge(eqx.Module):
     derivatives: TangentJudge | ProbeJudge | None
 
     def start(self, run: tuple, y0: Integrated) -> tuple[Array, JudgeState]:
-        """Returns the end of the first step, and the state of the judge.
-
-        `run`: the arguments of a controller's `init`; `y0`: the state at the start.
-        """
+        """Returns the end of the first step, and the state of the judge."""
         end, controller = constant(self.controller.wrap(1).init(*run))
         probe = () if self.derivatives is None else self.derivatives.start(y0)
         return end, JudgeState(controller, probe, jnp.zeros_like(end))
@@ -85,10 +76,7 @@ class Judge(eqx.Module):
     def __call__(
         self, step: StepEnds, error: PyTree, order: float, before: JudgeState
     ) -> tuple[NextStep, JudgeState, diffrax.RESULTS]:
-        """Returns the step that the controller plans next, and the state after this.
-
-        Also returns whether its end is healthy. `before`: the state before it.
-        """
+        """Returns the planned next step, the state after this one, and its result."""
         controller, probe, loss = before
         # Is its end singular, or not finite?
         health = diffrax.RESULTS.successful
@@ -115,8 +103,8 @@ class Judge(eqx.Module):
     ) -> JudgeState:  # fmt: skip
         """Returns the state of the judge before the next step.
 
-        `after`, `before`: the states at the ends of the step before; `y1`: its end;
-        `resumes`: whether its length says nothing, so that the controller is as before.
+        `after`, `before`: those at the ends of this step; `y1`: its end; `resumes`:
+        whether the controller keeps its old state.
         """
         controller, probe, loss = after
         if self.derivatives is not None:
@@ -148,8 +136,7 @@ class Judge(eqx.Module):
 def without_nan(error: PyTree) -> PyTree:
     """Returns an error with infinity for what is not a number.
 
-    A step may be so long that stages overflow, though its end is finite; diffrax's
-    controllers would find no next length.
+    Stages of a long step may overflow; diffrax's controllers would find no next length.
     """
     return jax.tree.map(lambda e: jnp.where(jnp.isnan(e), jnp.inf, e), error)
 
@@ -161,10 +148,7 @@ def _above_rounding(
     of_derivatives: Array | None,
     order: float | None,
 ) -> PyTree:
-    """Returns the error of a step without what is rounding.
-
-    `of_derivatives`: the error of derivatives over their tolerance, which counts too.
-    """
+    """Returns the error of a step without rounding, but with that of derivatives."""
     error, health, _ = estimate
     t0, t1, y0, y1, args = step
     same_step = _same_step(control, order)
@@ -204,10 +188,10 @@ def _same_step(controller: ErrorControl, order: ArrayLike | None) -> ArrayLike:
 def _rounding(
     revolute: Sequence[Array], health: Health, y0: Integrated, y1: Integrated
 ) -> PyTree:
-    """Estimates the rounding errors of a step in each velocity or momentum.
+    """Estimates the rounding errors of a step in each velocity.
 
     A velocity changes by its acceleration, and its direction turns with the links.
-    Joints that lose accuracy disturb those that do not.
+    Joints that lose accuracy disturb the others.
     """
     joints: PyTree = tuple(revolute), health
     if eqx.is_array(y0[1]):

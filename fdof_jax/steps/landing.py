@@ -37,8 +37,7 @@ _LONGER = 64
 def clearance(ts: Array) -> Array:
     """Returns the distance kept from known times in a run over the times `ts`.
 
-    It is relative to the largest of them, because even a known time of 0 is subject to
-    rounding where steps begin at other times.
+    It is relative to the largest of them, as rounding affects even a known time of 0.
     """
     return _APART * jnp.finfo(ts.dtype).eps * constant(jnp.max(jnp.abs(ts)))
 
@@ -68,13 +67,13 @@ class Clock(NamedTuple):
 class Found(NamedTuple):
     """Findings in a step: where it should end.
 
-    - `until`: when the step should have ended; its end if nothing switched before [s].
-    - `unseen`: a time before which a switching function may have passed 0 unseen; the
-      step's end if none may [s].
-    - `soon`: the time of a switch that follows soon after the end; else the end [s].
-    - `near`: how far from its zero a switching function may switch [s].
-    - `switched`: whether any switches at the end; `resets`: whether one of them resets
-      the state, None if none can.
+    - `until`: when the step should have ended [s]; its end if nothing switched before.
+    - `unseen`: a time before which a function may have passed 0 unseen [s]; else the
+      end.
+    - `soon`: the time of a switch that follows soon after the end [s]; else the end.
+    - `near`: how far from its zero a function may switch [s].
+    - `switched`: whether any switches at the end; `resets`: whether any resets the
+      state, None if none can.
     """
 
     until: Array
@@ -111,9 +110,9 @@ class _OtherEnd(NamedTuple):
 
     - `passed`: it passed a switch, and should end there.
     - `short`: it aims at one, and ends just before.
-    - `unsure`: a shorter step sees what this one may have passed over.
-    - `missed`: it aims at a switch and ends well before: it is kept, and the next one
-      ends where the switch was passed.
+    - `unsure`: it may have passed one unseen.
+    - `missed`: it aims at one and ends well before. It is kept, and the next one ends
+      where the switch was passed.
     """
 
     passed: Array
@@ -124,11 +123,7 @@ class _OtherEnd(NamedTuple):
 
 
 class Landing(eqx.Module):
-    """Ends steps at known times and where elements switch.
-
-    Lengths that the controller chooses are constants in derivatives: up to the
-    tolerance, the motion does not depend on where its steps end.
-    """
+    """Ends steps at known times and where elements switch."""
 
     jumps: Array | None
     clocks: tuple[Clock, ...]
@@ -137,7 +132,6 @@ class Landing(eqx.Module):
 
     @property
     def timed(self) -> bool:
-        """True if there are known times."""
         return self.jumps is not None or bool(self.clocks)
 
     def _known(self, t: Array) -> Array | None:
@@ -147,11 +141,7 @@ class Landing(eqx.Module):
         return jnp.concatenate(times) if times else None
 
     def end_of_run(self, ts: Array) -> Array:
-        """Returns the end of the last step: the last time, or a little later.
-
-        It is later where rates jump at the last time. Else the loop would move the end
-        of the step before that jump onto it.
-        """
+        """Returns the end of the last step: `ts[-1]`, or later if rates jump there."""
         end = ts[-1]
         last = _last(end)
         if (jumps := self._known(last)) is None:
@@ -178,7 +168,7 @@ class Landing(eqx.Module):
         return jnp.where(reached, end, t1), gap, reached
 
     def start(self, t0: Array, t1: Array, end: Array) -> tuple[Array, LandingState]:
-        """Returns the end of the first step, where the controller ends it at `end`."""
+        """Returns the end of the first step, which the controller ends at `end`."""
         length, last = end - constant(t0), _last(t1)
         end, gap, cut = self._cut(constant(t0), t0 + length, last)
         if self.switches:  # a step of no length finds the sides
@@ -191,7 +181,6 @@ class Landing(eqx.Module):
     def _other_end(
         self, begin: Array, end: Array, found: Found | None, state: LandingState
     ) -> _OtherEnd:
-        """Returns whether a step should end elsewhere, and where."""
         if found is None:
             no = jnp.zeros((), bool)
             return _OtherEnd(no, no, no, no, end)
@@ -219,7 +208,7 @@ class Landing(eqx.Module):
     ) -> tuple[NextStep, Array, LandingState]:  # fmt: skip
         """Returns the next step, and whether the controller resumes its old state.
 
-        `planned`: what the controller would do. A step is one of these:
+        A step is one of these (`planned`: by the controller):
 
         | step | next step |
         |---|---|

@@ -1,10 +1,8 @@
 """The loop of an integration: steps of diffrax's methods, taken by hand.
 
-diffrax documents this way of scheme: its methods take the steps, and its controllers
-choose their lengths. Between the two stands what `diffeqsolve` has no place for: steps
-end where something happens, and are judged by more than their error. What happens (an
-element switches, a joint stops, a state is reset) is done by the step that begins
-there, anew each time it is tried; the one that ended there has only found it.
+Unlike those of `diffeqsolve`, steps end where something happens, and are judged by more
+than their error. A step only finds what happens at its end. The next one does it, anew
+each time it is tried.
 """
 
 from typing import Any, NamedTuple
@@ -32,10 +30,7 @@ _SLACK, _MOST = 1.5, 7 / 8
 
 
 class Problem(NamedTuple):
-    """An initial value problem.
-
-    - `ts`: output times; the run is from the first to the last.
-    """
+    """An initial value problem over the output times `ts`."""
 
     term: ScheduledTerm
     start: Integrated
@@ -46,13 +41,10 @@ class Problem(NamedTuple):
 class Scheme(NamedTuple):
     """The numerical scheme: method, control and ends of steps.
 
-    - `method`, `controller`: those of diffrax. `dt0`: length of the first step, or None
-      for the controller's estimate.
-    - `judge`, `events`, `landing`: None if the controller judges no errors (it is not
-      adaptive in diffrax's sense); the last two also if nothing happens in the run.
-    - `adjoint`: which derivatives the loops can have.
-    - `lanes`: the axis of a batch in which a lane gives up when most others are long
-      done, or None.
+    - `dt0`: length of the first step, None for the controller's estimate.
+    - `judge`, `events`: None if the controller judges no errors; `events` also if
+      nothing switches. `landing`: None without events and known times.
+    - `lanes`: the axis of a batch in which a lane gives up when most are long done.
     """
 
     method: Any
@@ -71,18 +63,15 @@ class Attempt(NamedTuple):
     """The state of the loop: a step to try, and what is known before it.
 
     - `t`, `end`: where the step begins and is to end [s].
-    - `y`: the state at `t`, before what happens there; `jumped`: whether rates may jump
-      there: the step before ended at a known time or at a switch, or the controller
-      says so. None if they never do.
-    - `method`: state of the method. `judged`: that of `Judge`, or without one of the
-      controller; `wrappers`: of controllers around the one that judges errors.
-    - `landing`, `switches`: states of `Landing` and of `Events`, None without them.
-    - `sampled`: what a controller has sampled (see `ScheduledTerm`), None without one.
+    - `y`: the state at `t`, before what happens there.
+    - `jumped`: whether rates may jump there, because the step before ended at a known
+      time or a switch, or the controller says so; None if they never do.
+    - `judged`: state of `Judge`, or else of the controller; `wrappers`: of controllers
+      around the one that judges errors.
     - `rows`: states at output times, infinite at those to come; `saved`: how many are
       there.
-    - `meter`: state of the progress meter.
-    - `steps`, `accepted`: numbers of steps tried and kept; `typical`: how many steps
-      most lanes took (see `Scheme.lanes`).
+    - `steps`, `accepted`: numbers of steps tried and kept; `typical`: how many most
+      lanes took.
     - `result`: the first failure, if any.
     """
 
@@ -108,10 +97,9 @@ class Attempt(NamedTuple):
 class _StepResult(NamedTuple):
     """A step that was taken, whether it is kept or not.
 
-    - `args`: what is in force in it. `y1`: the state at its end; `path`: there and
-      between. `error`: by the method, an `Estimate` if that has checked the end too.
-    - `method`, `switches`: states at its end. `failed`: result of the method.
-    - `found`: what happens in it.
+    - `y1`: the state at its end; `path`: there and between.
+    - `error`: by the method, an `Estimate` if that has checked the end too.
+    - `failed`: result of the method; `found`: what happens in the step.
     """
 
     args: Arguments
@@ -125,7 +113,7 @@ class _StepResult(NamedTuple):
 
 
 class _FixedAnswer(diffrax.AbstractStepSizeController):
-    """Stands for a controller within others, which change the answer that it gives."""
+    """Stands for a controller within others, which change its answer."""
 
     answer: Any
 
@@ -140,10 +128,7 @@ class _FixedAnswer(diffrax.AbstractStepSizeController):
 
 
 def solve(problem: Problem, scheme: Scheme) -> Attempt:
-    """Integrates a problem; returns the state of the loop at its end.
-
-    A failure is its `result`.
-    """
+    """Integrates a problem; returns the last state of the loop, with any failure."""
     ts, landing, most = problem.ts, scheme.landing, scheme.most_steps
     last = ts[-1] if landing is None else landing.end_of_run(ts)
     kind, checkpoints = _kind_of(scheme)
@@ -215,7 +200,6 @@ def solve(problem: Problem, scheme: Scheme) -> Attempt:
 
 
 def _first_attempt(problem: Problem, scheme: Scheme, last: Array) -> Attempt:
-    """Returns the state of the loop before the first step."""
     (term, y0, args, ts), t0 = problem, problem.ts[0]
     method, controller, judge = scheme.method, scheme.controller, scheme.judge
     events, landing = scheme.events, scheme.landing
@@ -266,7 +250,7 @@ def _first_attempt(problem: Problem, scheme: Scheme, last: Array) -> Attempt:
 
 
 def _taken(problem: Problem, scheme: Scheme, a: Attempt) -> _StepResult:
-    """Takes a step, after what happens where it begins; returns what happens in it."""
+    """Does what happens where a step begins, and takes the step."""
     term, _, args, _ = problem
     method, events = scheme.method, scheme.events
     y0, regime, found, switches = a.y, None, None, None
@@ -334,7 +318,6 @@ def _planned(
 def _planned_without_errors(
     scheme: Scheme, a: Attempt, step: StepEnds, error: PyTree, order: float
 ) -> tuple[NextStep, Any, PyTree, PyTree]:
-    """Returns what `_planned` does, by a controller that judges no errors."""
     *plan, judged, result = scheme.controller.wrap(1).adapt_step_size(
         *step, error, order, a.judged
     )
@@ -352,9 +335,8 @@ def _after_gap(
 ) -> Integrated:
     """Returns the state where the next step begins, before what happens there.
 
-    One step ends just before a known time, the next begins just after it (see
-    `clearance`); at switches nothing is left out. The motion goes on meanwhile: of many
-    known times, what is left out would add up.
+    Steps leave a gap at known times (see `clearance`). The motion goes on meanwhile, as
+    the gaps of many such times would add up.
     """
     landing = scheme.landing
     if landing is None or not landing.timed:
@@ -400,7 +382,6 @@ def _saved(
 
 
 def _row(y: Integrated, args: Arguments) -> PyTree:
-    """Returns what is saved of a state: itself, modes if joints are held, samples."""
     modes, sampled = args.modes, args.sampled
     modes = None if modes is None else modes._replace(events=None)
     if sampled is not None:
@@ -413,7 +394,7 @@ def _together(
 ) -> tuple[diffrax.RESULTS, Array]:
     """Returns a result that gives up if most other lanes are long done.
 
-    Also returns how many steps most of them took, 0 as long as they go on.
+    Also returns how many steps most of them took, or 0.
     """
     # Once a lane is done its state is frozen, so that its count falls behind.
     done = steps < jax.lax.pmax(steps, lanes)
@@ -425,7 +406,6 @@ def _together(
 
 
 def _never_jumps(controller: Controller) -> bool:
-    """Returns whether a controller never says that rates jump after a step."""
     fixed = diffrax.ConstantStepSize, diffrax.StepTo
     return type(controller) in (diffrax.PIDController, EagerController, *fixed)
 

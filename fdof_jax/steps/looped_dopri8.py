@@ -1,9 +1,7 @@
 """Dormand-Prince 8(7) with a loop over its stages: one copy of the equations.
 
-Where XLA compiles the loop as one kernel, a single arm is solved about as fast as with
-unrolled stages, at less than half the compile time. diffrax's own Dopri8 is such a loop
-too. Fig 7 compiles and runs in half its time with this solver, and with derivatives in
-three quarters: it is traced once and leaves out what only other methods need.
+It solves a single arm about as fast as unrolled stages, at less than half the compile
+time.
 """
 
 from typing import Any, ClassVar
@@ -32,8 +30,6 @@ from .term import health_if
 
 
 def _weighted(weights: Array, rates: PyTree) -> PyTree:
-    """Sums the rates of all stages, each times its weight."""
-
     def weighted(k):
         # For a matrix product XLA would call a library, which costs more at this size.
         return jnp.sum(weights.reshape(-1, *[1] * (k.ndim - 1)) * k, axis=0)
@@ -103,7 +99,7 @@ class _Interpolation(DenseOutput):
 class LoopedDopri8(ScheduledDopri8):
     """The method of `diffrax.Dopri8` up to rounding, for a single arm.
 
-    `replayed`: whether reverse mode may replay its steps, which takes longer to trace.
+    `replayed`: whether reverse mode may replay its steps.
     """
 
     replayed: bool = eqx.field(static=True, default=True)

@@ -1,8 +1,8 @@
-"""Derivatives of the time of an event, to second order, in plain code.
+"""Derivatives of the time of an event, to second order.
 
-Steps have constant lengths for derivatives, but the time of an event depends on the
-parameters. At the end of the step to an event, the state moves on to that time with the
-equations before, and back with those after: this changes nothing but derivatives.
+Steps have constant lengths for derivatives, but events do not have constant times. So
+the state moves on to that time with the equations before, and back with those after:
+only its derivatives change.
 """
 
 from functools import partial
@@ -20,11 +20,10 @@ from .term import Arguments, Integrated, Term
 class Event(NamedTuple):
     """The instant at which the modes of joints may change.
 
-    - `before`, `t`: times just before it and just after it [s]; of a reset, `t` is the
-      very time of its zero.
+    - `before`, `t`: times just before and just after it [s]; of a reset, `t` is exact.
     - `fired` (kind, joint): which guards of modes came to their zeros.
-    - `late`: 0, whose derivatives are those of the time of the event less `before`.
-    - `resets` (reset,): which elements reset the state, None if none can.
+    - `late`: 0, with the derivatives of its time less `before`.
+    - `resets` (reset,): which elements reset the state, or None.
     """
 
     before: Array
@@ -72,8 +71,8 @@ def lateness(
 ) -> Array:
     """Returns when a switching function is 0, less the time `t` of arrival there.
 
-    This is 0, with derivatives: two of Newton's steps from the zero are right to second
-    order, the second one with the slope halfway. Without a slope nothing is late.
+    This is 0, with derivatives. Two of Newton's steps are right to second order, the
+    second with the slope halfway. Without a slope nothing is late.
     """
     function = lambda t, y: term.switches(t, y, args)[0][which]
     value = function(t, y)
@@ -95,8 +94,7 @@ def gained(
 ) -> Integrated:  # fmt: skip
     """Returns how the time of a switch changes the state: 0, with derivatives.
 
-    `before`, `after`: the arguments there; `switched`: which functions are 0, maybe
-    none.
+    `before`, `after`: the arguments there; `switched`: which functions are 0, if any.
     """
 
     def across():
@@ -113,8 +111,7 @@ def gained(
 def gained_at_kink(*at: PyTree, term: Term) -> Integrated:
     """Returns `gained` where no rate jumps: its first derivatives are 0, too.
 
-    These are neither computed nor traced: in the program of `tune`, they would be two
-    thirds of the lines.
+    They are not even traced, which keeps programs short.
     """
     return jax.tree.map(jnp.zeros_like, at[1])
 

@@ -21,22 +21,20 @@ Health = tuple[Array, ...]  # one per joint, see `ScheduledTerm`
 class ScheduledTerm(diffrax.ODETerm):
     """A term whose vector field takes a fourth argument, which depends on time alone.
 
-    `schedule(t, args)` computes this argument, in steps at all `SCHEDULE_SHARES`.
-    `health(t, y, args)` holds the loss of accuracy in the rates of each joint, at least
-    1, or 0 where the equations are singular. `watched_field` returns the rates and
-    their health, NaN if they are not finite.
-    `switching` returns the switching functions (n,), and with which something jumps.
+    - `schedule(t, args)` computes this argument, in steps at all `SCHEDULE_SHARES`.
+    - `health(t, y, args)` is the loss of accuracy in the rates of each joint, at least
+      1, or 0 where the equations are singular.
+    - `watched_field` returns the rates and their health, NaN if they are not finite.
+    - `switching` returns the switching functions (n,), and with which something jumps.
 
-    Where joints are held for a while, `args.modes` says which. `unknown_modes(args)`
-    returns the modes before the start, and how many of the last switching functions
-    guard them: positive while a mode lasts. `resolve(event, y, args)` returns the state
-    and the modes after an event.
+    Each may be None:
 
-    Between samples of a controller, `args.sampled` holds what it has sampled. Where a
-    step begins, `sample(t, y, args)`, if any, returns it anew, and whether it changed.
-
-    `settle(t, y, args)`, if any, returns the state from which a step begins: that after
-    the blow of joints that follow a motion, if their velocities jump there.
+    - `unknown_modes(args)` returns the modes before the start, and how many of the last
+      switching functions guard them: positive while a mode lasts.
+    - `resolve(event, y, args)` returns the state and the modes after an event.
+    - `settle(t, y, args)` returns the state after a jump of prescribed velocities.
+    - `sample(t, y, args)` returns a new `args.sampled`, of a controller, and whether it
+      changed.
     """
 
     vector_field: Callable[..., PyTree] = eqx.field(static=True)

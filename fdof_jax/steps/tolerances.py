@@ -1,4 +1,4 @@
-"""Tolerances of steps: the default controller, others, and changes of any."""
+"""Tolerances of steps, and controllers for them."""
 
 import dataclasses
 from collections.abc import Callable
@@ -35,7 +35,7 @@ def _with(
     controller: _C,
     concerns: Callable[[object], bool],
 ) -> _C:
-    """Returns a controller with `change` applied where `concerns` is true."""
+    """Applies `change` in a controller where `concerns` is true."""
     return jax.tree.map(
         lambda node: change(node) if concerns(node) else node,
         controller,
@@ -46,23 +46,21 @@ def _with(
 def with_pid(
     change: Callable[[diffrax.PIDController], Controller], controller: _C
 ) -> _C:
-    """Returns a controller with `change` applied to the PID controllers in it."""
+    """Applies `change` to the PID controllers in a controller."""
     return _with(change, controller, lambda n: isinstance(n, diffrax.PIDController))
 
 
 def _controls_errors(node: object) -> bool:
-    """Returns whether it is a controller that judges errors, not one around it."""
+    """Returns whether a node judges errors itself."""
     wraps = isinstance(node, diffrax.ClipStepSizeController)
     return isinstance(node, ErrorControl) and not wraps
 
 
 def with_error_control(change: Callable[..., Controller], controller: _C) -> _C:
-    """Returns a controller with `change` applied to the one that judges errors."""
     return _with(change, controller, _controls_errors)
 
 
 def error_control_of(controller: Controller) -> ErrorControl:
-    """Returns the controller that judges errors: itself, or one within it."""
     nodes = jax.tree.leaves(controller, is_leaf=_controls_errors)
     return next(filter(_controls_errors, nodes))
 
@@ -81,8 +79,7 @@ def with_tolerances(
 ) -> diffrax.AbstractSolver:
     """Returns a method that solves equations to the tolerances of a controller.
 
-    That is what implicit methods of diffrax do by default. Raises ValueError if there
-    are none.
+    Implicit methods of diffrax do so by default. Raises ValueError if there are none.
     """
     if not isinstance(method, diffrax.AbstractImplicitSolver):
         return method
@@ -110,8 +107,8 @@ def with_tolerances(
 def by_square_roots(controller: Controller) -> Controller:
     """Returns a controller for methods of order 8: the same steps, without powers.
 
-    A step changes by the eighth root of its error. XLA on CPU calls the C library's
-    `pow` for each lane, but square roots are vectorised: a sweep takes 4 % less time.
+    A step changes by the eighth root of its error; XLA on CPU vectorises square roots,
+    but no powers.
     """
 
     def without_powers(pid: diffrax.PIDController) -> diffrax.PIDController:
@@ -133,9 +130,7 @@ def by_square_roots(controller: Controller) -> Controller:
 class EagerController(diffrax.PIDController):
     """An integral controller that may shorten the next step even after one it keeps.
 
-    After a step that it keeps, diffrax's controller never takes a shorter one, even if
-    the error has come close to the tolerance: the next step is then often rejected. In
-    a batch of Fig 5 that is every fifth step.
+    diffrax's never does, and its next step is then often rejected.
     """
 
     safety: float = 0.8  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -156,7 +151,7 @@ class EagerController(diffrax.PIDController):
 
 
 def of_precision(double: _T, single: _T) -> _T:
-    """Returns what serves the precision that JAX has now."""
+    """Returns what serves the current precision of JAX."""
     return double if jnp.result_type(float) == jnp.float64 else single
 
 
@@ -168,7 +163,6 @@ def _shortest_step() -> float:
 def adaptive(
     rtol: float | Array | np.ndarray, atol: float | Array | np.ndarray
 ) -> diffrax.PIDController:
-    """Returns a controller with a relative and an absolute tolerance."""
     shortest = _shortest_step()
     # In float32 the rounding errors of stiff forces, which nothing estimates, are not
     # far below usual tolerances; to shorten steps after them would be to chase them.
@@ -181,7 +175,6 @@ def _default_tolerance() -> float:
 
 
 def default_controller() -> diffrax.PIDController:
-    """Returns the default controller of `simulate` and `sweep`."""
     return adaptive(_default_tolerance(), _default_tolerance())
 
 
@@ -197,7 +190,7 @@ def at_tolerances(
 
 
 def _number(name: str, value: ArrayLike) -> Array | np.ndarray:
-    """Returns a positive number as an array, of which new values need no new trace."""
+    """Returns a positive number as an array, whose new values need no new trace."""
     number = real_numbers(name, value, (), above=0)
     # Else a derivative with respect to it would fail later, without this name.
     traced = is_traced(number)
@@ -205,7 +198,6 @@ def _number(name: str, value: ArrayLike) -> Array | np.ndarray:
 
 
 def with_longest(controller: Any, max_step: ArrayLike) -> Controller:
-    """Returns the controller with a longest step [s]."""
     longest = _number("max_step", max_step)
     return with_pid(lambda pid: dataclasses.replace(pid, dtmax=longest), controller)
 

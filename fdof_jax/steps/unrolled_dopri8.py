@@ -1,10 +1,7 @@
 """Dormand-Prince 8(7) with its stages unrolled, as a diffrax solver.
 
-diffrax runs the stages of a Runge-Kutta method as a loop that writes to buffers. Such a
-loop compiles fast, but the buffers cost more than the cheap equations of a linkage.
-Unrolled, each stage becomes one fused loop over the batch, and zeros of the tableau
-cost nothing: 2 times faster in a batch of 1024, 3.5 times for a single arm, for 2 s
-more of compilation (one core, jax 0.10.2).
+Each stage is one fused loop over the batch, without buffers: a batch of 1024 takes half
+the time of diffrax's loop.
 """
 
 from collections.abc import Sequence
@@ -59,8 +56,7 @@ def _combine(coefficients: Sequence[Array] | np.ndarray, rates: Rates) -> PyTree
 def _increment(row: np.ndarray, rates: Rates, y0: State, h: Array) -> State:
     """Sums coefficients times rates.
 
-    Velocities at stages are sums of accelerations, so that displacements are too.
-    Stages that need no stored velocities take 5 % less time (AMD EPYC, 1024 arms).
+    Velocities at stages are sums of accelerations, so displacements are too.
     """
     others = [rate[1:] for rate in rates]
     accelerations = [rate[1] for rate in rates]
@@ -80,8 +76,7 @@ class _End(NamedTuple):
     """The end of a step, with its error and what the next step needs.
 
     `rate` and its `health` are those at the end. `residue` is the rounding error of
-    `y`, which the next step adds (Kahan): over 1000 s of Fig 5 in steps of 2.5 ms the
-    energy drifts by 3e-11 J, not 1.5e-10 J.
+    `y`, which the next step adds (Kahan).
     """
 
     y: State
@@ -131,8 +126,8 @@ class _Interpolation(DenseOutput):
 class UnrolledDopri8(ScheduledDopri8):
     """The method of `diffrax.Dopri8` up to rounding, for large batches.
 
-    It serves states that begin with displacements and their rates. It is not meant for
-    derivatives, which take far longer to compile.
+    States begin with displacements and their rates. Derivatives take far longer to
+    compile.
     """
 
     interpolation_cls: ClassVar = _Interpolation
@@ -141,7 +136,6 @@ class UnrolledDopri8(ScheduledDopri8):
         return self._start(terms, t0, y0, args), jax.tree.map(jnp.zeros_like, y0)
 
     def _start(self, terms, t0, y0, args):
-        """Returns the rates and their health at the start of a step."""
         return terms.watched_field(t0, y0, args, terms.schedule(t0, args))
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):

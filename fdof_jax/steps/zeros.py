@@ -53,7 +53,7 @@ _ELSEWHERE = 12
 
 
 class _Margin(NamedTuple):
-    """Switching functions, positive on the side in force, in a step: (n,) each."""
+    """Switching functions in a step, positive on the side in force: (n,) each."""
 
     past: Array  # (sample, n), from the places where steps end, beyond the zeros
     slopes: Array  # (sample, n), per step
@@ -64,7 +64,7 @@ class _Margin(NamedTuple):
 
 
 def _sum(weights: np.ndarray, rows: Sequence[Array]) -> Array:
-    """Returns a weighted sum; over an axis of an array, XLA would call a library."""
+    """Returns a weighted sum of rows; for an array, XLA would call a library."""
     terms = (float(w) * row for w, row in zip(weights, rows))
     return functools.reduce(operator.add, terms)
 
@@ -78,8 +78,8 @@ def _margins(
 ) -> _Margin:
     """Returns the margin of one function by its polynomial through `values`.
 
-    The error of polynomials shows in their last terms and at the further samples
-    `checks`. What may be rounding does not count, as shorter steps have it too.
+    Errors show in the polynomial's last terms and at the further samples `checks`;
+    rounding does not count, as shorter steps have it too.
     """
     eps, largest = jnp.finfo(before.dtype).eps, _largest(tuple(values))
     rows, others = ([side * value for value in part] for part in (values, checks))
@@ -99,9 +99,8 @@ def _margins(
 def _size_of_motion(rows: Sequence[Array], slope: Array, largest: Array) -> Array:
     """Returns the size of a margin up to its zero.
 
-    A step that is tried may go far beyond it, to where the motion never comes. Before
-    the second sample a parabola tells, from the `slope` at the start. A margin that is
-    on its zero and does not rise has no size but `largest`.
+    A step that is tried may go far beyond. Before the second sample, `slope` gives a
+    parabola. A margin that is on its zero and does not rise has no size but `largest`.
     """
     rise = jnp.maximum(slope * float(SHARES[1]), 0)
     over = (rise > 0) & (rows[1] < 0)
@@ -117,8 +116,7 @@ def _size_of_motion(rows: Sequence[Array], slope: Array, largest: Array) -> Arra
 def _turns(margins: _Margin) -> tuple[Array, Array]:
     """Returns where margins turn back to rising between two samples, and their values.
 
-    These are the shares of the step and the values of cubics, infinite if there is no
-    such place.
+    These are shares of the step and values of cubics, or else infinite.
     """
     past, slopes = margins.past, margins.slopes
     least = margins.offset  # smaller changes are rounding
@@ -139,15 +137,15 @@ def _turns(margins: _Margin) -> tuple[Array, Array]:
 class Passage(NamedTuple):
     """Zeros of switching functions in a step, and those at its end.
 
-    - `until`: the share of the step where a margin first passes 0, 1 if none does;
-      `crossed`: whether any does.
+    - `until`: the share of the step where a margin first passes 0, else 1; `crossed`:
+      whether any does.
     - `missed`: how near to grazing a margin turned back, 0 if not near.
-    - `unseen`: a share of the step where a margin may pass 0 unseen, in the middle of
-      two samples, or else 1.
-    - `switched` (n,): which margins are near their zeros at the step's end; `grazing`:
-      how they graze.
-    - `soon`: the share of the step after which another follows soon, or 0.
-    - `sizes` (n,): the largest sizes of the values, also in steps before.
+    - `unseen`: a share, midway between two samples, where a margin may pass 0 unseen,
+      or 1.
+    - `switched` (n,): which margins are near zeros at the end; `grazing`: how they
+      graze.
+    - `soon`: the share after which another follows soon, or 0.
+    - `sizes` (n,): the largest sizes so far.
     """
 
     until: Array
@@ -167,13 +165,10 @@ def passage(
 ) -> Passage:  # fmt: skip
     """Returns where switching functions pass 0 in a step, and which do at its end.
 
-    Margins are their values (sample, n) on the sides in force (n,): positive as long as
-    nothing switches.
-
-    `checks`: the values at further places of the step; `begun`: which began on their
-    zeros, as after a switch; `before`: the largest sizes in steps before; `near`: a
-    share of the step; `brief`: whether the step is so short that nothing is looked for
-    in between.
+    Margins are their values (sample, n) on the sides in force (n,). `checks`: values at
+    further places; `begun`: which began on their zeros; `before`: the largest sizes
+    before; `near`: a share of the step; `brief`: whether the step is too short to look
+    for zeros in between.
     """
     if not before.size:
         zero, no = jnp.zeros((), values.dtype), jnp.zeros((), bool)
@@ -197,7 +192,7 @@ def _first_zero(
 ) -> tuple[Array, Array, Array]:
     """Returns the first three parts of the `Passage`.
 
-    A margin that falls by less than it may be wrong is left to `_hiding_place`.
+    A margin that falls by less than its possible error is left to `_hiding_place`.
     """
     past, unsure = margins.past, margins.unsure[None]
     # What is on the wrong side from the start on, as after a jump, changes at once,
@@ -237,7 +232,7 @@ def _first_zero(
 
 
 def _hiding_place(margins: _Margin, lowest: Array, begun: Array, near: Array) -> Array:
-    """Returns a share of the step where a margin may pass 0 unseen, or else 1."""
+    """Returns a share of the step where a margin may pass 0 unseen, else 1."""
     past, unsure = margins.past, margins.unsure[None]
     # Margins on their zeros at the ends do not turn back within.
     ending = jnp.abs(past[-1] - margins.offset) <= -margins.slopes[-1] * near
