@@ -538,8 +538,9 @@ MORE = {
     "ode_term": [
         *((words, dict(scene=BARE._replace(forces=(element,)))) for words, element in (
             *((".*no element that holds", held) for held in (FRICTION, STOPS, BRAKE)),
-            (".*no PrescribedMotion", MOVED),
-            (".*no Payload with a begin", elements.HOLDING["taken"]),
+            *((".*no PrescribedMotion, Reset, Until or", one) for one in (
+                MOVED, elements.HOLDING["taken"], RESET, fj.simulation.Until(height),
+            )),
             (".*an array of 3 real numbers", returns(0.0)),
         )),
     ],

@@ -94,10 +94,10 @@ def added_inertia(
         coordinates = lambda q, e=element: e.coordinates(q, linkage)
         along = lambda q, c=coordinates: jax.jvp(c, (q,), (qd,))[1]
         _, turning = jax.jvp(along, (q,), (qd,))
-        energy = lambda q, e=element: e.potential_energy(q, linkage)
-        jacobian, slope = jax.jacfwd(lambda q: (coordinates(q), energy(q)))(q)
+        jacobian = jax.jacfwd(coordinates)(q)
         weighted = _weights(element, linkage, turning)[:, None] * jacobian
         matrices.append(jnp.sum(weighted[:, :, None] * jacobian[:, None, :], axis=0))
+        slope = jax.jacfwd(lambda q, e=element: e.potential_energy(q, linkage))(q)
         biases.append(jnp.sum(weighted * turning[:, None], axis=0) + slope)
     matrix, bias = (reduce(add, rows) for rows in (matrices, biases))
     upper = tuple(tuple(row[k:]) for k, row in enumerate(matrix))

@@ -7,10 +7,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
-from ..base.checks import instance
+from ..base.checks import instance, refusal
 from ..forces.holders import check_free
 from ..linkage.coordinates import real_state
 from ..linkage.linkage import check_linkage, without_fixed
+from .conditions import conditions_in
 from .field import Args, args_of, initial_own, schedule_of, vector_field, whole
 from .holding import changes
 from .prescribed import prescribed
@@ -25,15 +26,14 @@ def ode_term(scene: Scene) -> tuple[diffrax.ODETerm, _Y, Args]:
     `diffrax.diffeqsolve(term, solver, 0, t1, dt0, y0, args)` offers dense solutions,
     diffrax's events, and noise by a `MultiTerm` (see the recipes). Unlike `simulate`,
     it does not end steps where elements jump or switch, so derivatives there may be
-    wrong. Rounding errors may shorten its steps, no result reports a singular arm, and
-    an `Until` has no effect.
+    wrong. Rounding errors may shorten its steps, and no result reports a singular arm.
 
     **Returns:** `(term, y0, args)`. `y0` is `(q, qd, own)`: positions (n,) [m or rad],
     velocities (n,), and the elements' own states in one array (m,).
     `term.vf(t, y, args)` returns its rates.
 
     **Raises:** ValueError for malformed scenes, and for elements that hold joints, a
-    `Payload` that arrives, a `Reset` and a `PrescribedMotion`.
+    `Payload` with a `begin`, a `PrescribedMotion`, a `Reset` and an `Until`.
 
     >>> import diffrax
     >>> import fdof_jax as fj
@@ -50,12 +50,13 @@ def ode_term(scene: Scene) -> tuple[diffrax.ODETerm, _Y, Args]:
     linkage, state0, forces, _ = with_full_size(scene)
     start = real_state("scene.state0", state0, linkage)
     for index, element in enumerate(forces):
-        check_free(f"scene.forces[{index}]", element)
-    if prescribed(forces) is not None or changes(forces):
-        raise ValueError(
-            "scene.forces: expected no PrescribedMotion, and no Payload with a begin, "
-            "because only simulate computes their blows, got one."
-        )
+        check_free(name := f"scene.forces[{index}]", element)
+        alone = (element,)
+        if prescribed(alone) or changes(alone) or conditions_in(alone):
+            expected = (
+                "no PrescribedMotion, Reset, Until or Payload with a begin, which "
+            )
+            raise refusal(name, expected + "only simulate carries out", element)
     q, qd = (without_fixed(linkage, jnp.asarray(value)) for value in start)
     args = args_of(linkage, q, forces)
     y0 = q, qd, jnp.array(initial_own(args), q.dtype)

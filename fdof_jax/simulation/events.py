@@ -65,7 +65,7 @@ def resolve(event: Event, y: Integrated, args: Args) -> tuple[Integrated, Modes]
     fired = fired.at[: len(event.fired)].set(event.fired)
     slides = ~before.held
     # What is at its stop. Also those that are as near as a flight that is left out:
-    # otherwise joints whose blows throw each other at their stops would hit them in
+    # otherwise joints whose impacts throw each other at their stops would hit them in
     # turn without end.
     near = jnp.finfo(q.dtype).eps ** LOW
     at_lower = fired[1] | (q <= law.lower + near)
@@ -75,7 +75,7 @@ def resolve(event: Event, y: Integrated, args: Args) -> tuple[Integrated, Modes]
     late = jnp.zeros_like(event.t)
     if HardStops in kinds:
         hits = fired[1] | fired[2]
-        y, late = _at_the_blow(event.before, y, hits, stop, args)
+        y, late = _at_impact(event.before, y, hits, stop, args)
     delta, rates_before, *own = y
     q, qd = args.q0 + jnp.stack(delta), jnp.stack(rates_before)
     q = jnp.where(touched != 0, stop, q)
@@ -95,7 +95,7 @@ def resolve(event: Event, y: Integrated, args: Args) -> tuple[Integrated, Modes]
         still = system.still(start, qd)
         qd = system.caught(qd, law.braked)
         if HardStops in kinds:
-            qd, hit = _after_blows(qd, touched, law, system)
+            qd, hit = _after_impacts(qd, touched, law, system)
             qd = _stilled(qd, may_rest, still)
             net = _net_efforts(event.t, q, qd, own, args)
             qd, left_out = _settled(qd, touched, law, *net)
@@ -110,7 +110,7 @@ def resolve(event: Event, y: Integrated, args: Args) -> tuple[Integrated, Modes]
     origin = q - args.q0
     kind = _happenings(before, modes, hit & (modes.mode == FREE), law)
     qd = jnp.where(modes.mode > FREE, 0, qd)
-    # Modes in which a motion begins are no events, but blows at the start are.
+    # Modes in which a motion begins are no events, but impacts at the start are.
     kind = jnp.where(first & (qd == start), -1, kind)
     at = event.t + event.late + left_out - late
     events = before.events
@@ -134,12 +134,12 @@ def _stilled(qd: Array, joints: Array, still: Array) -> Array:
     return jnp.where(rests, qd - constant(qd), qd)
 
 
-def _at_the_blow(
+def _at_impact(
     t: Array, y: Integrated, hits: Array, stop: Array, args: Args
 ) -> tuple[Integrated, Array]:
     """Returns the state when the first joint hit its stop, and how long ago that was.
 
-    If only positions moved back onto stops, each blow would add or take energy.
+    If only positions moved back onto stops, each impact would add or take energy.
     """
     rates = _rates(t, y, args)
     q, qd, qdd = args.q0 + jnp.stack(y[0]), jnp.stack(y[1]), jnp.stack(rates[1])
@@ -199,18 +199,18 @@ def _net_efforts(
     return system, jnp.stack(minus(tau, system.equations.bias))
 
 
-def _after_blows(
+def _after_impacts(
     qd: Array, touched: Array, law: Laws, system: System
 ) -> tuple[Array, Array]:
-    """Returns the rates after all blows, and which joints were hit.
+    """Returns the rates after all impacts, and which joints were hit.
 
-    The fastest joint comes first. After one blow per joint, what is left is stopped at
-    once, without restitution.
+    The fastest joint comes first. After one impact per joint, what is left is stopped
+    at once, without restitution.
     """
     joints, moves = jnp.arange(qd.size), ~law.braked
     outward = lambda qd: constant(jnp.where(moves, touched * qd, 0))
 
-    def blow(state, _):
+    def impact(state, _):
         qd, hit = state
         k = jnp.argmax(outward(qd))
         one = (joints == k) & (outward(qd) > 0)
@@ -226,7 +226,7 @@ def _after_blows(
         return (system.caught(qd, caught | law.braked), caught), None
 
     none = jnp.zeros(qd.size, bool)
-    (qd, hit), _ = jax.lax.scan(blow, (qd, none), length=qd.size)
+    (qd, hit), _ = jax.lax.scan(impact, (qd, none), length=qd.size)
     (qd, caught), _ = jax.lax.scan(stop, (qd, none), length=qd.size)
     return qd, hit | caught
 

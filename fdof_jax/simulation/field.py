@@ -162,7 +162,7 @@ def followed(
 
 
 def with_prescribed_rates(t: Array, y: Integrated, args: Args) -> Integrated:
-    """Returns a state after the blow of a jump of prescribed velocities.
+    """Returns a state after the impact of a jump of prescribed velocities.
 
     M_FF dqd_F = -M_FH dqd_H; held joints stay held.
     """

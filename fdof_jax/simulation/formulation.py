@@ -82,7 +82,7 @@ def clocks_apart(args: Args, ts: Array) -> Args:
 
     Otherwise derivatives would attribute all jumps to one element. Each clock is ahead
     of the one before by some units of rounding. A controller's are behind all others,
-    because it measures what is left of a blow.
+    because it measures what is left of an impact.
     """
     # A prescribed motion also gives positions, and comes first: it keeps the time.
     motion = prescribed(args.forces)

@@ -42,8 +42,8 @@ LOW = 0.7
 # Distances from stops are in this part of a metre or rad, so that the distance by which
 # steps end beyond zeros is short even for a joint that bounces slowly.
 _STOPS_IN = 100
-# Rates of so many units of rounding count as zero [m/s or rad/s]; after a blow also as
-# many of the rate that a joint would have with all kinetic energy.
+# Rates of so many units of rounding count as zero [m/s or rad/s]; after an impact also
+# as many of the rate that a joint would have with all kinetic energy.
 STILL = 500
 # What was found at its limit is held only if it needs this much less, as a share.
 _SURE = 1e-7
@@ -196,7 +196,7 @@ class System(NamedTuple):
         return jnp.stack(times(self.equations.mass, tuple(qd)))
 
     def still(self, *rates: Array) -> Array:
-        """Returns the rates (n,) that count as zero after a blow."""
+        """Returns the rates (n,) that count as zero after an impact."""
         energies = jnp.stack([qd @ self.momenta(qd) for qd in rates])
         inertia = jnp.where(self.inertia > 0, self.inertia, jnp.inf)
         return (
@@ -210,7 +210,7 @@ class System(NamedTuple):
         return jnp.stack([row[0] for row in self.equations.mass])
 
     def caught(self, qd: Array, held: Array) -> Array:
-        """Returns the rates after a blow that stops joints.
+        """Returns the rates after an impact that stops joints.
 
         M_FF qd_F+ = M_FF qd_F + M_FB qd_B, with B the joints stopped.
         """

@@ -122,7 +122,7 @@ def _prepare(
         return *joints_at(args, t, y), own_states(args, y)
 
     begin = start if term.settle is None else term.settle(ts[0], start, args)
-    q, qd, _ = joints(ts[0], begin)  # after a blow there, like all that follows
+    q, qd, _ = joints(ts[0], begin)  # after an impact there, like all that follows
     known = known_times(args)
     of_problem = term, start, args
     # Loops of few motions compile and run faster in arrays.
@@ -219,7 +219,7 @@ def _read(
         """Replaces infinity by NaN, at times that were not reached."""
         return jnp.where(jnp.isinf(a) | ~valid, jnp.nan, a)
 
-    # The start is saved with the first step, after any blow there.
+    # The start is saved with the first step, after any impact there.
     saved = None if modes is None else jnp.isfinite(qd[0]) & valid
 
     def from_start(rows, start, given):

@@ -17,8 +17,8 @@ from .integrate import Inputs, integrate
 from .scene import Scene
 from .solution import Solution
 
-# Tolerance of each step, and that of its tangents over it. Fig 7's mean squared error of
-# the tip is then right to 1e-7 of itself, and its gradient in six gains too.
+# Tolerance of each step, and that of its tangents over it. Fig 7's mean squared error
+# of the tip is then right to 1e-7 of itself, and its gradient in six gains too.
 TOLERANCE, _OF_TANGENTS = 1e-5, 300.0
 
 

@@ -149,11 +149,11 @@ class Solution(eqx.Module):
       once.
 
     With elements that hold joints (`JointFriction`, `HardStops`, `Brake`), a `Payload`
-    or a `Reset`, else None (the first `qd` are then those after blows at the start):
+    or a `Reset`, else None (the first `qd` are then those after impacts at the start):
 
     - `modes`: what holds each joint at `ts`: 0 nothing, 1 friction, 2 its lower stop, 3
       its upper stop, 4 a brake. At an event it is the mode before or after it.
-    - `taken`: energy taken up to `ts` by friction, blows, brakes, resets and the
+    - `taken`: energy taken up to `ts` by friction, impacts, brakes, resets and the
       catching of payloads [J]. Friction whose level is a function is not counted.
     - `events`: the `Events`, whose times have derivatives.
 

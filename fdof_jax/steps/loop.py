@@ -261,8 +261,8 @@ def _taken(problem: Problem, scheme: Scheme, a: Attempt) -> _StepResult:
         args = args._replace(sides=regime.sides, modes=regime.modes)
     if term.settle is not None:
         y0, jumped = term.settle(a.t, y0, args), True  # rates of before are out of date
-    # After all blows, of which a controller measures what is left; its commands move no
-    # joint at once.
+    # After all impacts, of which a controller measures what is left; its commands move
+    # no joint at once.
     if term.sample is not None:
         sampled, changed = term.sample(a.t, y0, args)
         args, jumped = args._replace(sampled=sampled), jumped | changed
