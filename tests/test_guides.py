@@ -46,7 +46,6 @@ def test_models(monkeypatch):
     names = run(DOCS / "models.md")
     np.testing.assert_allclose(names["motion"].q[-1], 0, atol=0.02)
     assert names["tuned"].tip_error < 0.02
-    assert names["step"].met.all()
     first = str(names["fj"].from_mjcf("docs/models/cart_pole.xml").account)
     assert first in page  # which shows what it prints
 
@@ -76,7 +75,6 @@ def test_conditions():
     times = np.cumsum(phases) - phases[0] / 2
     found = names["swings"].events.table["t [s]"]
     np.testing.assert_allclose(found, times, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(names["drop"].end.t, np.sqrt(2 / 9.81) * 2.5, rtol=1e-11)
     np.testing.assert_allclose(names["multiplier"], [[names["kept"] ** 2]], rtol=1e-9)
     locked = np.sqrt(1.5 * names["one"] * names["two"] / 1.3)
     np.testing.assert_allclose(names["locked"], locked, rtol=1e-10)
