@@ -169,7 +169,7 @@ def two_bars() -> Iterator[Row]:
     (hits, *_) = fj.simulate(TWO, start, [0, 1.1 * begin], (stop,)).events.t
     braked = fj.simulate(TWO, start, [0, begin + JUST], (brake,)).qd[-1]
     hit = fj.simulate(TWO, start, [0, hits + JUST], (stop,)).qd[-1]
-    # M = (a, b; b, 1/3): an impulse in joint 2 changes the rates by a multiple of (-b, a).
+    # M = (a, b; b, 1/3): an impulse in joint 2 changes rates by a multiple of (-b, a).
     a, b = 5 / 3 + np.cos(0.8), 1 / 3 + np.cos(0.8) / 2
     for name, qd, after in (
         ("two bars, brake on joint 2", braked, 0.0),
