@@ -22,6 +22,3 @@ def test_examples():
     assert (largest[1:] < 20).all()
     np.testing.assert_allclose(names["driven"].q[-1], names["target"], atol=0.01)
     assert 0 < names["fj"].analysis.margins(names["loop"]).phase
-    circle, _ = names["around"](1.0, names["pendulum"])
-    np.testing.assert_allclose(names["traced"].q[-1], circle, atol=0.05)
-    assert 0.5 < names["rolling"].q[-1, 0] < 1.0  # 2 N on 1 to 1.3 kg

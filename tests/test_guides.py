@@ -46,7 +46,6 @@ def test_models(monkeypatch):
     names = run(DOCS / "models.md")
     np.testing.assert_allclose(names["motion"].q[-1], 0, atol=0.02)
     assert names["tuned"].tip_error < 0.02
-    assert names["step"].met.all()
     first = str(names["fj"].from_mjcf("docs/models/cart_pole.xml").account)
     assert first in page  # which shows what it prints
 
@@ -76,7 +75,6 @@ def test_conditions():
     times = np.cumsum(phases) - phases[0] / 2
     found = names["swings"].events.table["t [s]"]
     np.testing.assert_allclose(found, times, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(names["drop"].end.t, np.sqrt(2 / 9.81) * 2.5, rtol=1e-11)
     np.testing.assert_allclose(names["multiplier"], [[names["kept"] ** 2]], rtol=1e-9)
     locked = np.sqrt(1.5 * names["one"] * names["two"] / 1.3)
     np.testing.assert_allclose(names["locked"], locked, rtol=1e-10)
@@ -143,13 +141,11 @@ def test_recipes(tmp_path, monkeypatch):
     np.testing.assert_allclose(np.linalg.norm(pushes, axis=0), 1)
     names["show"](length=0.5)  # errors within `interact` are only printed
     assert names["value"] < 0.06
-    for read, written in (("kept", "policy"), ("again", "scenes")):
-        assert eqx.tree_equal(names[read], names[written])
+    assert eqx.tree_equal(names["kept"], names["policy"])
     assert names["rewards"].shape == (500, 256) and names["done"].sum() >= 512
     assert names["found"].success and names["found"].fun < 0.01
     assert names["room"](names["found"].x).min() > -1e-6
     np.testing.assert_allclose(names["slope"], names["difference"], rtol=1e-6)
-    assert 35 < np.mean(names["lift"] ** 2) < 37
     assert names["efforts"].shape == (26, 2) and abs(names["efforts"]).max() <= 12
     assert not names["efforts"][:, 1].any()
     push = names["fj"].forces.EffortHistory(np.linspace(0, 2.5, 26), names["efforts"])
@@ -161,7 +157,6 @@ def test_recipes(tmp_path, monkeypatch):
     assert 0.0220 < (2 * names["best"].cost) ** 0.5 < 0.0226  # the controller: 0.0501
     np.testing.assert_allclose(names["state"].q, names["upright"], atol=1e-2)
     assert (names["result"] == names["diffrax"].RESULTS.successful).all()
-    assert names["robust"].member_loss.max() ** 0.5 < 0.025
     fallen = names["fj"].simulate(names["falls"], [0, 1.234, 3.0])
     np.testing.assert_allclose(names["between"], fallen.q[1], atol=1e-6)
     last = names["fj"].tip_position(names["arm"], names["ended"].ys[0][-1])
