@@ -162,7 +162,7 @@ WRONG_BY_NAME = dict(
         [0, 1, 0, 0.5], [0, 1, 0, np.nan], [0, 1, 0, 1j], ["0", "1"],
     ],
     max_steps=[0, -1, True], chunk=[0, -1, True], samples=[0, True], starts=[0, True],
-    seed=[-1], max_frames=[0], every=[0], configurations=[1], direction=[2], fps=[0],
+    seed=[-1], max_frames=[0], every=[0], configurations=[1], direction=[2, True], fps=[0],
     speed=[-1], until=[-1, ()], shard=[-1, 1], of=[0, True], dt0=[0.0, -1e-3],
     rtol=[0], atol=[[1e-6]], own0=[(0.0,)], progress_meter=[3], reduce=[3, "q"],
     adjoint=[diffrax.BacksolveAdjoint(), diffrax.ImplicitAdjoint()],
@@ -550,7 +550,7 @@ MORE = {
         *each("damping_ratio: .* at least 0", "damping_ratio", -0.1),
     ],
     "open_loop": [
-        *each(r"joint: expected one of \(1, 2, 3\), got [04]", "joint", 0, 4),
+        *each(r"joint: expected one of \(1, 2, 3\), got [04T]", "joint", 0, 4, True),
         acting("forces: expected elements", LAG),
         *each("controller: expected a force element", "controller", 3.0),
         *each("controller: expected one that", "controller", MOVED),
