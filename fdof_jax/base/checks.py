@@ -306,7 +306,7 @@ def whole_number(name: str, value: Any, minimum: int, most: int | None = None) -
 
 
 def one_of(name: str, value: object, options: Sequence[Any]) -> Any:
-    """Returns `value` if it is among `options`, or raises ValueError, also for bools."""
+    """Returns `value` if it is one of `options`, no bool; else raises ValueError."""
     plain_value = isinstance(value, str | int | float | np.number)
     if plain_value and not isinstance(value, bool) and value in options:
         return options[options.index(value)]
