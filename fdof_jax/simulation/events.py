@@ -53,7 +53,7 @@ def resolve(event: Event, y: Integrated, args: Args) -> tuple[Integrated, Modes]
     energy_taken = jnp.zeros_like(event.t)
     if resets := resets_in(args.forces):
         for element, met in zip(resets, event.resets):
-            y, more = _after_reset(element, met, event.t + event.late, y, args)
+            y, more = _after_reset(element, met, event.t, y, args)
             energy_taken += more
     if PrescribedMotion in kinds:
         # Impulses move what friction and stops hold.
@@ -112,11 +112,11 @@ def resolve(event: Event, y: Integrated, args: Args) -> tuple[Integrated, Modes]
     qd = jnp.where(modes.mode > FREE, 0, qd)
     # Modes in which a motion begins are no events, but blows at the start are.
     kind = jnp.where(first & (qd == start), -1, kind)
-    at = event.t + event.late + left_out - late
+    at = event.t + left_out - late
     events = before.events
     if resets:
         reset = jnp.where(event.resets.any(), _RESET, -1)[None]
-        events = _recorded(events, event.t + event.late, reset, first=0)
+        events = _recorded(events, event.t, reset, first=0)
     events = _recorded(events, at, kind)
     modes = modes._replace(origin=origin, taken=before.taken + lost, events=events)
     state = tuple(origin), tuple(qd), *own
