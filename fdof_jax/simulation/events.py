@@ -78,7 +78,7 @@ def resolve(event: Event, y: Integrated, args: Args) -> tuple[Integrated, Modes]
         y, late = _at_the_blow(event.before, y, hits, stop, args)
     delta, rates_before, *own = y
     q, qd = args.q0 + jnp.stack(delta), jnp.stack(rates_before)
-    q = jnp.where(touched != 0, stop, q)
+    begun, q = q, jnp.where(touched != 0, stop, q)
     qd = jnp.where(fired[0] & slides, 0, qd)  # came to zero
     may_rest = law.rubs | (touched != 0)
     still = jnp.full_like(q, STILL * jnp.finfo(q.dtype).eps)
@@ -107,6 +107,9 @@ def resolve(event: Event, y: Integrated, args: Args) -> tuple[Integrated, Modes]
     slid = before.direction * (jnp.stack(delta) - before.origin)
     slid = toward(law.level, before.direction) * slid
     lost += jnp.sum(jnp.where(first, 0, slid))
+    # What leaves its stop, as at the start, keeps its own derivatives.
+    apart = ~hit & (modes.mode != LOWER) & (modes.mode != UPPER)
+    q = jnp.where(apart, begun - constant(begun) + constant(q), q)
     origin = q - args.q0
     kind = _happenings(before, modes, hit & (modes.mode == FREE), law)
     qd = jnp.where(modes.mode > FREE, 0, qd)
