@@ -168,6 +168,22 @@ def test_a_bucket_that_is_taken_has_the_mass_of_that_time():
     np.testing.assert_allclose(motion.qd[-1, 0], after, rtol=1e-12)
 
 
+@pytest.mark.slow
+def test_an_impact_takes_energy_of_the_mass_of_its_time():
+    """The fall of a slide with the bucket is free: what leaks keeps its speed."""
+
+    def taken(height):
+        floor = fj.forces.HardStops(0.0, np.inf, restitution=0.5)
+        start, ts = fj.State(height[None], [0.0]), jnp.array([0.0, 0.6])
+        forward = dict(adjoint=diffrax.ForwardMode())
+        return fj.simulate(SLIDE, start, ts, (floor, BUCKET), **forward).taken[-1]
+
+    exact = lambda height: 0.75 * (1 + left_in(jnp.sqrt(2 * height / G))) * G * height
+    values = jax.jit(lambda height: (taken(height), jax.jacfwd(taken)(height)))
+    found = values(jnp.array(1.0))
+    np.testing.assert_allclose(found, (exact(1.0), jax.grad(exact)(1.0)), rtol=1e-9)
+
+
 # Programs
 
 

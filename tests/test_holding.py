@@ -164,6 +164,22 @@ def test_second_derivatives_through_a_blow():
     np.testing.assert_allclose(twice(height), twice(closed_form), rtol=0, atol=1e-8)
 
 
+@pytest.mark.slow
+def test_a_start_on_a_stop_that_is_left_has_its_own_derivatives():
+    drop = SLIDE.replace(gravity=9.81)
+
+    def thrown(numbers):
+        start, floor, rate = numbers
+        state0 = fj.State(start[None], rate[None])
+        stops = HardStops(floor, inf)
+        return run(drop, state0, [0, 0.3], stops, adjoint=diffrax.ForwardMode()).q[
+            -1, 0
+        ]
+
+    slopes = jax.jit(jax.jacfwd(thrown), **LOOPS)(jnp.array([0.2, 0.2, 2.0]))
+    np.testing.assert_allclose(slopes, [1, 0, 0.3], rtol=0, atol=1e-11)
+
+
 def stopped(linkage, start, ts, stops, *, brake=NEVER, stiffness=0.0, effort=0.0):
     """Returns a motion between stops; what does not act lets all share a program."""
     spring = fj.forces.JointSpring(stiffness, rest=-1.0)

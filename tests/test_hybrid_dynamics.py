@@ -372,6 +372,32 @@ def test_stops_and_brakes_beside_a_kicked_table():
     np.testing.assert_allclose(kicked(taken=0.6).qd[1:, 1], -0.9, atol=1e-12)
 
 
+@pytest.mark.slow
+def test_a_load_bounces_off_the_stop_of_an_accelerated_table():
+    """As a ball that falls, by the acceleration of the table."""
+
+    def bounced(x):
+        room, acceleration = x
+        stop = fj.forces.HardStops(
+            -room * np.array([np.inf, 1]), np.inf, restitution=0.5
+        )
+        table = Accelerated(0.0, acceleration)
+        motion = on_table(stop, reference=table, ts=(0.0, 1.0), adjoint=FORWARD)
+        return jnp.stack([motion.q[-1, 1], motion.qd[-1, 1], motion.events.t[0]])
+
+    def exact(x):
+        room, acceleration = x
+        blow = jnp.sqrt(2 * room / acceleration)
+        back, since = acceleration * blow / 2, 1 - blow
+        q = -room + back * since - acceleration * since**2 / 2
+        return jnp.stack([q, back - acceleration * since, blow])
+
+    x = jnp.array([0.8, 3.0])
+    np.testing.assert_allclose(bounced(x), exact(x), atol=1e-11)
+    found = jax.jit(jax.jacfwd(bounced), **LOOPS)(x)
+    np.testing.assert_allclose(found, jax.jacfwd(exact)(x), atol=1e-9)
+
+
 def test_stops_and_brakes_of_prescribed_joints_are_refused():
     for element in (fj.forces.HardStops(-1, 1), fj.forces.Brake(1, begin=0, end=1)):
         with pytest.raises(ValueError, match="a joint whose motion is prescribed"):

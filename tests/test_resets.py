@@ -104,6 +104,35 @@ def test_derivatives_include_the_times_of_jumps():
 
 
 @pytest.mark.slow
+def test_a_ball_bounces_on_a_table_that_rises():
+    """As on one at rest, seen from there; so the condition depends on time itself."""
+
+    def bounced(x):
+        height, rise, restitution = x
+        above = lambda t, q, qd, linkage: q[0] - rise * t
+        thrown = lambda t, q, qd, linkage: (q, rise - restitution * (qd - rise))
+        start = fj.State(height[None], jnp.zeros(1))
+        motion = fj.simulate(
+            MASS, start, [0, 0.6], (Reset(above, thrown, -1),), **FORWARD
+        )
+        return jnp.stack([motion.q[-1, 0], motion.qd[-1, 0], motion.events.t[0]])
+
+    def exact(x):
+        height, rise, restitution = x
+        speed = jnp.sqrt(rise**2 + 2 * 9.81 * height)
+        blow, back = (speed - rise) / 9.81, restitution * speed
+        since = 0.6 - blow
+        q = rise * 0.6 + back * since - 9.81 * since**2 / 2
+        return jnp.stack([q, rise + back - 9.81 * since, blow])
+
+    x = jnp.array([1.0, 0.5, 0.6])
+    curves, (slopes, values) = twice(bounced)(x)
+    np.testing.assert_allclose(values, exact(x), atol=1e-12)
+    np.testing.assert_allclose(slopes, jax.jacfwd(exact)(x), atol=1e-9)
+    np.testing.assert_allclose(curves, jax.hessian(exact)(x), atol=1e-8)
+
+
+@pytest.mark.slow
 def test_a_rimless_wheel_has_the_multiplier_of_its_return_map():
     """A spoke of 1 m with all mass at the hub; each foot leaves cos(2 a) of its speed.
 

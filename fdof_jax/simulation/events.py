@@ -53,7 +53,7 @@ def resolve(event: Event, y: Integrated, args: Args) -> tuple[Integrated, Modes]
     energy_taken = jnp.zeros_like(event.t)
     if resets := resets_in(args.forces):
         for element, met in zip(resets, event.resets):
-            y, more = _after_reset(element, met, event.t + event.late, y, args)
+            y, more = _after_reset(element, met, event.t, y, args)
             energy_taken += more
     if PrescribedMotion in kinds:
         # Impulses move what friction and stops hold.
@@ -78,7 +78,7 @@ def resolve(event: Event, y: Integrated, args: Args) -> tuple[Integrated, Modes]
         y, late = _at_impact(event.before, y, hits, stop, args)
     delta, rates_before, *own = y
     q, qd = args.q0 + jnp.stack(delta), jnp.stack(rates_before)
-    q = jnp.where(touched != 0, stop, q)
+    begun, q = q, jnp.where(touched != 0, stop, q)
     qd = jnp.where(fired[0] & slides, 0, qd)  # came to zero
     may_rest = law.rubs | (touched != 0)
     still = jnp.full_like(q, STILL * jnp.finfo(q.dtype).eps)
@@ -107,16 +107,19 @@ def resolve(event: Event, y: Integrated, args: Args) -> tuple[Integrated, Modes]
     slid = before.direction * (jnp.stack(delta) - before.origin)
     slid = toward(law.level, before.direction) * slid
     lost += jnp.sum(jnp.where(first, 0, slid))
+    # What leaves its stop, as at the start, keeps its own derivatives.
+    apart = ~hit & (modes.mode != LOWER) & (modes.mode != UPPER)
+    q = jnp.where(apart, begun - constant(begun) + constant(q), q)
     origin = q - args.q0
     kind = _happenings(before, modes, hit & (modes.mode == FREE), law)
     qd = jnp.where(modes.mode > FREE, 0, qd)
     # Modes in which a motion begins are no events, but impacts at the start are.
     kind = jnp.where(first & (qd == start), -1, kind)
-    at = event.t + event.late + left_out - late
+    at = event.t + left_out - late
     events = before.events
     if resets:
         reset = jnp.where(event.resets.any(), _RESET, -1)[None]
-        events = _recorded(events, event.t + event.late, reset, first=0)
+        events = _recorded(events, event.t, reset, first=0)
     events = _recorded(events, at, kind)
     modes = modes._replace(origin=origin, taken=before.taken + lost, events=events)
     state = tuple(origin), tuple(qd), *own

@@ -188,7 +188,7 @@ class Events(eqx.Module):
         before = args._replace(sides=last.sides, modes=last.modes)
         fired = changed[-self.guards :].reshape(-1, last.modes.mode.size)
         time = jnp.where(last.early, t, last.until)
-        late, there, at = jnp.zeros_like(t), y, t
+        late, there = jnp.zeros_like(t), y
         resets: Any = None
         # What an event causes at once has the time of that event.
         comes = last.length > 0
@@ -200,15 +200,16 @@ class Events(eqx.Module):
                 lambda: jnp.where(comes, 0, last.late),
             )
             there = moved(late, time, y, before, self.term)
+        end = at = t + late
         if self.resets:
             resets = last.resets & jumped
             which = places_of(self.resets)[jnp.argmax(resets)]
             at, there = at_zero(
-                self.term, t, there, before, which, resets.any() & comes
+                self.term, end, there, before, which, resets.any() & comes
             )
         arrived_as = there, before
         own = before._replace(sides=sides)
-        event = Event(last.until, at, fired, late, resets)
+        event = Event(last.until + late, at, fired, resets)
         there, modes = self.term.resolve(event, there, own)
         after = args._replace(sides=sides, modes=modes)
         if self.resets:
@@ -219,9 +220,9 @@ class Events(eqx.Module):
             left = jnp.where(resets, left, sides[places])
             sides = sides.at[places].set(left.astype(t.dtype))
             after = args._replace(sides=sides, modes=modes)
-            there = later(self.term, t - at, at, there, after)
+            there = later(self.term, end - at, at, there, after)
         if self.derivatives:
-            there = moved(-late, t + late, there, after, self.term)
+            there = moved(-late, end, there, after, self.term)
         return there, modes, sides, late
 
     def _shifted(

@@ -20,16 +20,15 @@ from .term import Arguments, Integrated, Term
 class Event(NamedTuple):
     """The instant at which the modes of joints may change.
 
-    - `before`, `t`: times just before and just after it [s]; of a reset, `t` is exact.
+    - `before`, `t`: times just before and just after it [s], with its derivatives; of a
+      reset, `t` is exact.
     - `fired` (kind, joint): which guards of modes came to their zeros.
-    - `late`: 0, with the derivatives of its time less `before`.
     - `resets` (reset,): which elements reset the state, or None.
     """
 
     before: Array
     t: Array
     fired: Array
-    late: Array
     resets: Any  # Array | None
 
 
