@@ -17,7 +17,4 @@ __all__ = [
     "check_joints", "check_known", "check_linkage", "instance", "one_of", "per_joint",
     "plain", "real_array", "refusal", "shown", "whole_number",
 ]  # fmt: skip
-
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = __all__.copy

@@ -21,10 +21,7 @@ __all__ = [
     "bias_force", "constraint_forces", "from_chain", "masked_accelerations",
     "mass_matrix", "to_chain",
 ]  # fmt: skip
-
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = __all__.copy
 
 
 @compiled("q", "qd")

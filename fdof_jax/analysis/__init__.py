@@ -23,7 +23,4 @@ __all__ = [
     "linearize", "loop_matrices", "Margins", "margins", "Modes", "open_loop",
     "regressor", "Response", "response", "step_measures",
 ]  # fmt: skip
-
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = __all__.copy

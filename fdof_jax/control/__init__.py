@@ -16,7 +16,4 @@ __all__ = [
     "FirstOrderLag", "gains_from_frequency", "GravityFeedforward", "PDController",
     "PIDController", "SpeedLimit",
 ]  # fmt: skip
-
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = __all__.copy

@@ -10,7 +10,4 @@ __all__ = [
     "from_mjcf", "load", "MjcfModel", "Report", "save", "to_mjcf", "to_pandas",
     "to_xarray",
 ]  # fmt: skip
-
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = __all__.copy

@@ -19,7 +19,4 @@ __all__ = [
     "SpringDamper", "StatefulElement", "stribeck", "switch", "Tension", "Values",
     "Wrench",
 ]  # fmt: skip
-
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = __all__.copy

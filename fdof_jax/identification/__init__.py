@@ -8,7 +8,4 @@ from .result import FitResult
 __all__ = [
     "fit", "fit_each", "FitResult", "link_ends", "next_motion", "NextMotion",
 ]  # fmt: skip
-
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = __all__.copy

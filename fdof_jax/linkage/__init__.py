@@ -9,7 +9,4 @@ __all__ = [
     "existence_factors", "Frames", "joint_names", "link_frames", "Linkage",
     "moving_joints", "State", "TOPOLOGIES",
 ]  # fmt: skip
-
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = __all__.copy

@@ -58,10 +58,7 @@ _LEADER: Keywords = dict(arrowstyle="-", lw=0.8, shrinkA=0, shrinkB=5)
 # About so many configurations have their time, at the first of these angles [rad] from
 # their last link at which nothing lies below.
 _TIMES, _TURNS = 5, np.pi / 6 * np.array([0, 1, -1, 2, -2, 3, -3, 4, -4, 5, -5, 6])
-
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = __all__.copy
 
 
 def draw_linkage(

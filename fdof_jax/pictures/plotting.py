@@ -41,10 +41,7 @@ __all__ = [
 # Efforts are shown larger while most of their changes are made, with some room, if that
 # is a short part of the time, but of many samples.
 _BUSY, _ROOM, _SHORT, _SAMPLES = (0.01, 0.85), 0.15, 0.25, 20
-
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = __all__.copy
 
 
 def motion_profile(

@@ -11,7 +11,4 @@ __all__ = [
     "Pulse", "Ramp", "reach_margin", "reachable", "Reference", "reference_of",
     "SetPoint", "Spline", "Step", "TipTask", "Travel",
 ]  # fmt: skip
-
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = __all__.copy

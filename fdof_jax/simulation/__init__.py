@@ -11,7 +11,4 @@ __all__ = [
     "accepts_scene", "Efforts", "End", "Events", "ode_term", "PrescribedMotion",
     "Until",
 ]  # fmt: skip
-
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = __all__.copy

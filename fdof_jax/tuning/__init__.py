@@ -10,7 +10,4 @@ __all__ = [
     "joint_errors", "Limits", "stacked", "tip_errors", "Tracking", "tune",
     "tune_within", "TunedWithin", "TuneResult",
 ]  # fmt: skip
-
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = __all__.copy
