@@ -190,9 +190,9 @@ def sweep(
     each member ended. With `reduce`, its arrays with that axis: NaN, or a
     `motion.result` among them, marks failed members. With `store`, its path.
 
-    Under `jax.grad` or another transformation a failed member adds nothing to any
-    derivative; `solution.result == diffrax.RESULTS.successful` selects the others.
-    Finding them takes one more solve.
+    Under `jax.grad` or another transformation a failed member adds nothing to
+    derivatives; `solution.result == diffrax.RESULTS.successful` selects the others.
+    Finding failed members takes one more solve.
 
     **Raises:** ValueError for malformed arguments; RuntimeError, with `throw=True`, if
     a member fails; ImportError, with `store`, where zarr is not installed. Warns of

@@ -86,7 +86,7 @@ class JointFriction(Holder):
     positive and smooth in each direction, such as `stribeck`. The value at qd = 0 holds
     joints at rest; an attribute `jump_ts` lists times at which the function jumps.
     Negative values, and static friction below the level, end a motion as not finite.
-    `Solution.taken` does not count a level that is a function.
+    `Solution.taken` does not count friction whose level is a function.
 
     **Raises:** ValueError for malformed arguments, and for `static` beside `speed`.
 

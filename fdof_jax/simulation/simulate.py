@@ -193,7 +193,7 @@ def simulate(
     - `max_step`: longest step [s], by default unlimited. Set it for efforts so brief
       that steps would pass over them.
     - `solver`, `stepsize_controller`, `dt0`, `adjoint`, `max_steps`, `throw`,
-      `progress_meter`: as in `diffrax.diffeqsolve`. None selects Dopri8 and adaptive
+      `progress_meter`: as in `diffrax.diffeqsolve`. By default Dopri8 takes adaptive
       steps. A controller excludes `rtol`, `atol` and `max_step`. `dt0` is 1 ms; with
       `None` the controller estimates it, which fails from exact rest. Reverse mode
       works with the default `adjoint`, forward mode with `diffrax.ForwardMode()`.

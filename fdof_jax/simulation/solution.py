@@ -127,7 +127,8 @@ class Solution(eqx.Module):
     """A simulated motion, with its statistics and outcome.
 
     - `ts`: output times [s].
-    - `q`, `qd`: joint positions [m or rad] and velocities at `ts`; NaN after a failure.
+    - `q`, `qd`: joint positions [m or rad] and velocities at `ts`, the first after any
+      impacts at the start; NaN after a failure.
     - `stats`: diffrax's statistics, such as `num_steps`, `time_reached` [s], and those
       below.
     - `result`: diffrax's result, one per trajectory; `outcome` states it in words.
@@ -149,7 +150,7 @@ class Solution(eqx.Module):
       once.
 
     With elements that hold joints (`JointFriction`, `HardStops`, `Brake`), a `Payload`
-    or a `Reset`, else None (the first `qd` are then those after impacts at the start):
+    or a `Reset`, else None:
 
     - `modes`: what holds each joint at `ts`: 0 nothing, 1 friction, 2 its lower stop, 3
       its upper stop, 4 a brake. At an event it is the mode before or after it.
