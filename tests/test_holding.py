@@ -7,7 +7,7 @@ import numpy as np
 import pandas
 import pytest
 from elements import SHORT, START, arm
-from held_scenes import derivative_errors, law_errors
+from held_scenes import derivative_errors, law_errors, reverse
 from modes import LOOPS, hessian
 from scipy.linalg import expm
 
@@ -381,5 +381,5 @@ def test_laws_of_random_scenes(seed):
 @pytest.mark.parametrize("seed", [37, 112, 142, 243, 336, 350])  # of two joints
 def test_derivatives_in_random_scenes(seed):
     """In reverse mode they equal extrapolated differences of tight solves."""
-    errors = derivative_errors(seed)
+    errors = derivative_errors(seed, reverse)
     assert max(errors.values()) <= 1, errors
