@@ -234,9 +234,10 @@ def test_a_brake_holds_to_the_last_bit():
     """The compensated sum carries rounding errors of the steps before."""
     for begin in np.linspace(0.25, 0.75, 11):
         motion = run(PAIR, MOVING, np.linspace(0, 1, 41), ANYWHERE, Brake(2, begin))
-        later = motion.ts > begin
-        np.testing.assert_array_equal(motion.qd[later, 1], 0)
-        assert np.ptp(motion.q[later, 1]) == 0
+        # In NumPy, as in JAX each number of rows is another program.
+        ts, q, qd = map(np.asarray, (motion.ts, motion.q, motion.qd))
+        np.testing.assert_array_equal(qd[ts > begin, 1], 0)
+        assert np.ptp(q[ts > begin, 1]) == 0
 
 
 @pytest.mark.slow
