@@ -197,6 +197,12 @@ MUTANTS = {
         "flying = jnp.where(one, e * qd,",
         BOUNCES,
     ),
+    "a restitution has no derivative": Mutant(
+        "simulation/events.py",
+        "e = law.restitution[k]",
+        "e = constant(law.restitution[k])",
+        "tests/test_held_bounces.py::test_derivatives_through_a_hundred_bounces",
+    ),
     "low flights go on": Mutant(
         "simulation/events.py",
         "low = pulled & (constant(qd**2) <= 2 * towards * lowest)",
@@ -296,7 +302,13 @@ MUTANTS = {
         "pass",
         f"{SAMPLED}::test_noise_is_what_the_key_says",
     ),
-    # Drives and tuning
+    # Drives, controllers and tuning
+    "fixed pairs of a model accelerate": Mutant(
+        "control/pd.py",
+        "where(fixed, jnp.zeros_like(b), a + b) for fixed, a, b in rows",
+        "a + b for _, a, b in rows",
+        "tests/test_chain_elements.py::test_elements_act_alike",
+    ),
     "braking is limited as driving is": Mutant(
         "control/drives.py",
         "right = clip(1 + qd / self.no_load, 0, 1)",
