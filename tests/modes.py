@@ -1,7 +1,10 @@
 """The modes of differentiation that tests ask for by name, and their compilation."""
 
+from functools import partial
+
 import diffrax
 import jax
+import numpy as np
 
 from fdof_jax.base.configuration import options_of_loops
 
@@ -14,18 +17,36 @@ ADJOINT = diffrax.RecursiveCheckpointAdjoint(checkpoints=1024)
 LOOPS = dict(compiler_options=options_of_loops())
 
 
-def twice(function):
-    """Returns a program for second derivatives, and a pair: first ones, and values.
+def jacobian(function):
+    """Returns a function for the Jacobian in forward mode, and the values.
 
-    All are by forward mode, in one compilation.
+    It takes one direction at a time. `jax.jacfwd` takes all at once, which is traced
+    and compiled for half as long again; a second derivative, for twice as long.
     """
 
-    def first(x):
-        values = function(x)
-        return values, values
+    @partial(jax.jit, **LOOPS)
+    def along(x, direction, *rest):
+        return jax.jvp(lambda x: function(x, *rest), (x,), (direction,))
 
-    def second(x):
-        slopes, values = jax.jacfwd(first, has_aux=True)(x)
-        return slopes, (slopes, values)
+    def of(x, *rest):
+        found = [along(x, axis, *rest) for axis in np.eye(len(x))]
+        columns = [column for _, column in found]
+        return jax.tree.map(lambda *c: np.stack(c, -1), *columns), found[0][0]
 
-    return jax.jit(jax.jacfwd(second, has_aux=True), **LOOPS)
+    return of
+
+
+def hessian(function):
+    """Returns a function for second derivatives, the Jacobian and the values."""
+
+    def first(x, direction):
+        return jax.jvp(function, (x,), (direction,))
+
+    second = jacobian(first)
+
+    def of(x):
+        found = [second(x, axis) for axis in np.eye(len(x))]
+        slopes, curves = zip(*(columns for columns, _ in found))
+        return np.stack(curves, -1), slopes[0], found[0][1][0]
+
+    return of

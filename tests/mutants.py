@@ -40,6 +40,7 @@ SAMPLED = "tests/test_sampled_control.py"
 CONDITIONS, RESETS = "tests/test_conditions.py", "tests/test_resets.py"
 EVER_FASTER = f"{RESETS}::test_jumps_that_follow_each_other_ever_faster_are_named[0.1]"
 BOUNCES = f"{HOLDING}::test_a_mass_bounces_to_rest_at_a_known_time"
+FIRST_ENDS = f"{CONDITIONS}::test_the_first_of_several_ends_it"
 
 MUTANTS = {
     # Steps that end at switches and known times
@@ -196,11 +197,35 @@ MUTANTS = {
         "flying = jnp.where(one, e * qd,",
         BOUNCES,
     ),
+    "a restitution has no derivative": Mutant(
+        "simulation/events.py",
+        "e = law.restitution[k]",
+        "e = constant(law.restitution[k])",
+        "tests/test_held_bounces.py::test_derivatives_through_a_hundred_bounces",
+    ),
     "low flights go on": Mutant(
         "simulation/events.py",
         "low = pulled & (constant(qd**2) <= 2 * towards * lowest)",
         "low = jnp.zeros_like(pulled)",
         BOUNCES,
+    ),
+    "a blow without restitution is a bounce": Mutant(
+        "simulation/events.py",
+        "_BOUNCES: hit & (law.restitution > 0),",
+        "_BOUNCES: hit,",
+        f"{HOLDING}::test_a_blow_without_restitution_is_no_bounce[9.0-is stopped]",
+    ),
+    "rounding frees joints": Mutant(
+        "simulation/events.py",
+        "rests = joints & (jnp.abs(constant(qd)) <= constant(still))",
+        "rests = joints & (qd == 0)",
+        "tests/test_held_rounding.py::test_a_rounding_error_frees_no_joint",
+    ),
+    "a payload takes no energy": Mutant(
+        "simulation/events.py",
+        "            lost += more\n",
+        "",
+        "tests/test_phases.py::test_a_payload_is_taken_once_where_phases_meet[0]",
     ),
     "a payload arrives without momentum": Mutant(
         "simulation/events.py",
@@ -258,11 +283,50 @@ MUTANTS = {
         "lead[place] = rank + len(others)",
         f"{SAMPLED}::test_a_sample_sees_what_a_blow_leaves",
     ),
+    "a delay of whole periods is less": Mutant(
+        "simulation/sampled.py",
+        "rounding = 4 * float(",
+        "rounding = 0 * float(",
+        f"{SAMPLED}"
+        "::test_a_delay_of_whole_periods_is_known_in_either_precision[float64]",
+    ),
     "no command under way is late": Mutant(
         "simulation/sampling.py",
         "acting = under_way[(k - self.late) % len(under_way)]",
         "acting = tau",
         f"{SAMPLED}::test_efforts_are_held_and_come_late",
+    ),
+    "noise is left out": Mutant(
+        "simulation/sampling.py",
+        "q, qd = (value + rows[k] for value, rows in zip((q, qd), self.noise))",
+        "pass",
+        f"{SAMPLED}::test_noise_is_what_the_key_says",
+    ),
+    # Drives, controllers and tuning
+    "fixed pairs of a model accelerate": Mutant(
+        "control/pd.py",
+        "where(fixed, jnp.zeros_like(b), a + b) for fixed, a, b in rows",
+        "a + b for _, a, b in rows",
+        "tests/test_chain_elements.py::test_elements_act_alike",
+    ),
+    "braking is limited as driving is": Mutant(
+        "control/drives.py",
+        "right = clip(1 + qd / self.no_load, 0, 1)",
+        "right = left",
+        "tests/test_drives.py::test_a_speed_limit_in_four_quadrants",
+    ),
+    "a lag has no time": Mutant(
+        "control/drives.py",
+        "return own, (command - own) / self.time_constant",
+        "return command, (command - own) / self.time_constant",
+        "tests/test_drives.py::test_a_lag_is_an_exponential",
+    ),
+    "joints that nothing drives count": Mutant(
+        "tuning/losses.py",
+        "errors = jnp.where(driven, errors, 0)",
+        "pass",
+        "tests/test_limits.py"
+        "::test_the_errors_of_a_joint_that_nothing_drives_count_nothing[RR-kd1]",
     ),
     # Conditions
     "what switches at once has no time": Mutant(
@@ -290,6 +354,44 @@ MUTANTS = {
         "end, there = at_zero(self.term, t, y, args, which, ended)",
         f"{CONDITIONS}"
         "::test_a_jump_that_carries_a_condition_over_its_zero_ends_the_motion_there",
+    ),
+    "conditions have no direction": Mutant(
+        "steps/conditions.py",
+        "return passed[places] & ((wanted == 0) | (wanted == after[places]))",
+        "return passed[places]",
+        FIRST_ENDS,
+    ),
+    "the first condition listed ends a run": Mutant(
+        "steps/events.py",
+        "return jnp.where(ends.any(), jnp.argmax(ends), -1)",
+        "return jnp.where(ends.any(), 0, -1)",
+        FIRST_ENDS,
+    ),
+    "one Newton step to a zero": Mutant(
+        "steps/conditions.py",
+        "_NEWTON, _CONVERGED = 3, 0.01",
+        "_NEWTON, _CONVERGED = 1, 2.0",
+        f"{CONDITIONS}::test_a_fall_ends_on_the_floor",
+    ),
+    "straight to a zero": Mutant(
+        "steps/conditions.py",
+        "middle = _along(y, time / 2, term.vf(t, y, args))",
+        "middle = y",
+        f"{CONDITIONS}"
+        "::test_a_bar_comes_to_its_lowest_point_in_the_time_of_an_elliptic_integral",
+    ),
+    "a reset takes no energy": Mutant(
+        "simulation/events.py",
+        "jnp.subtract(*energies)",
+        "jnp.zeros_like(t)",
+        f"{RESETS}::test_a_ball_that_is_reset_bounces_as_on_a_stop",
+    ),
+    "a reset may leave hard stops": Mutant(
+        "simulation/events.py",
+        "qd = jnp.where(within_stops(args.forces, q, arm), qd, jnp.nan)",
+        "pass",
+        f"{RESETS}::test_functions_that_return_what_cannot_be_are_named"
+        "[wrong3-beyond a hard stop]",
     ),
     "what a reset turns round goes on": Mutant(
         "steps/conditions.py",

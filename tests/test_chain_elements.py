@@ -71,10 +71,8 @@ def without_fixed(tree):
 Q, QD, QDD, TAU = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (4, 3)))
 PD = fj.PDController([90.0, 70.0, 50.0], 2.0, np.inf, elements.Hold(Q))
 WEAK = PD.replace(limit=1e-6)
-SOME = tuple(
-    elements.ALL[name]
-    for name in ("computed torque", "spring", "actuator", "wrench", "motor with PID")
-)
+# At points, with masses and with states; all act in `test_elements_act_alike`.
+SOME = tuple(elements.ALL[name] for name in ("spring", "actuator", "motor with PID"))
 MASSES = tuple(elements.WITH_INERTIA.values())
 MOVE = fj.references.JointMove(Q, Q + 1, fj.references.Travel(1.0, profile="harmonic"))
 
@@ -141,7 +139,7 @@ def compare(found, expected, name=""):
 COMPARED = {
     "dynamics": (dynamics, (QDD, TAU, MASSES)),
     "motion": (moves, (SOME,)),
-    "linear": (linear, (SOME[1:2], QDD, TAU)),
+    "linear": (linear, (SOME[:1], QDD, TAU)),
     "sampled": (sampled, (WEAK.replace(limit=5.0),)),
     "demands": (demands, (WEAK,)),
     "equilibrium": (balanced, (PD,)),

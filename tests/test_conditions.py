@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from modes import LOOPS, twice
+from modes import LOOPS, hessian, jacobian
 from scipy.integrate import solve_ivp
 from scipy.special import ellipk
 
@@ -34,8 +34,7 @@ def fall(x, floor=None, **options):
     start = fj.State(jnp.stack([q0]), jnp.stack([qd0]))
     arm = MASS.replace(gravity=gravity)
     motion = fj.simulate(arm, start, [0, 1, 2.0, 9.0], until=above, **options)
-    values = jnp.stack([motion.end.t, motion.end.q[0], motion.end.qd[0]])
-    return values, values
+    return jnp.stack([motion.end.t, motion.end.q[0], motion.end.qd[0]])
 
 
 def fallen(x):
@@ -48,16 +47,15 @@ def fallen(x):
 def test_a_fall_ends_on_the_floor():
     """With first and second derivatives in all numbers, the condition's own too."""
     x = jnp.array([10.0, 1.0, 9.81, 0.3])
-    expected = jax.jacfwd(fallen)(x)
-    for jacobian, options in ((jax.jacfwd, FORWARD), (jax.jacrev, {})):
-        slopes_of = jacobian(partial(fall, **options), has_aux=True)
-        slopes, values = jax.jit(slopes_of, **LOOPS)(x)
-        np.testing.assert_allclose(values, fallen(x), rtol=1e-12)
-        np.testing.assert_allclose(slopes, expected, rtol=1e-10, atol=1e-12)
-    on_floor = lambda x: fall(jnp.append(x, 0.3), floor=0.3, **FORWARD)[0]
-    curves, _ = twice(on_floor)(x[:3])
-    exact = jax.jacfwd(jax.jacfwd(fallen))(x)[:, :3, :3]
-    np.testing.assert_allclose(curves, exact, atol=1e-10)
+    forward, values = jacobian(partial(fall, **FORWARD))(x)
+    reverse = jax.jit(jax.jacrev(fall), **LOOPS)(x)
+    np.testing.assert_allclose(values, fallen(x), rtol=1e-12)
+    exact = jax.jacfwd(fallen)
+    for slopes in (forward, reverse):
+        np.testing.assert_allclose(slopes, exact(x), rtol=1e-10, atol=1e-12)
+    on_floor = lambda x: fall(jnp.append(x, 0.3), floor=0.3, **FORWARD)
+    curves, *_ = hessian(on_floor)(x[:3])
+    np.testing.assert_allclose(curves, jax.jacfwd(exact)(x)[:, :3, :3], atol=1e-10)
 
 
 @pytest.mark.slow
@@ -106,7 +104,7 @@ def test_a_bar_comes_to_its_lowest_point_in_the_time_of_an_elliptic_integral():
     x = jnp.array([9.81, 1.3, 0.0])  # from level
     at_level = np.sqrt((1 / 12 + 1.3 / 4) / (1.3 * 9.81 / 2)) * ellipk(1 / 2)
     np.testing.assert_allclose(lowest_exactly(x)[0], at_level, rtol=1e-15)
-    curves, (forward, values) = twice(lambda x: lowest(x, **FORWARD))(x)
+    curves, forward, values = hessian(partial(lowest, **FORWARD))(x)
     reverse = jax.jit(jax.jacrev(lowest), **LOOPS)(x)
     np.testing.assert_allclose(values, lowest_exactly(x), rtol=0, atol=1e-11)
     exact = jax.jacfwd(lowest_exactly)
@@ -206,8 +204,7 @@ def test_a_jump_that_carries_a_condition_over_its_zero_ends_the_motion_there():
         stop = fj.forces.HardStops(0, jnp.inf, restitution=restitution)
         arm, start = MASS.replace(gravity=gravity), fj.State(q0[None], jnp.zeros(1))
         end = fj.simulate(arm, start, [0, 2.0], (stop,), until=rises, **options).end
-        values = jnp.stack([end.t, end.q[0], end.qd[0]])
-        return values, values
+        return jnp.stack([end.t, end.q[0], end.qd[0]])
 
     def exactly(x):
         q0, gravity, restitution = x
@@ -215,12 +212,11 @@ def test_a_jump_that_carries_a_condition_over_its_zero_ends_the_motion_there():
         return jnp.stack([fast / gravity, 0 * q0, restitution * fast])
 
     x = jnp.array([1.0, 9.81, 0.6])
-    expected = jax.jacfwd(exactly)(x)
-    for jacobian, options in ((jax.jacfwd, FORWARD), (jax.jacrev, {})):
-        slopes_of = jacobian(partial(bounced, **options), has_aux=True)
-        slopes, values = jax.jit(slopes_of, **LOOPS)(x)
-        np.testing.assert_allclose(values, exactly(x), atol=1e-11)
-        np.testing.assert_allclose(slopes, expected, atol=1e-10)
+    forward, values = jacobian(partial(bounced, **FORWARD))(x)
+    reverse = jax.jit(jax.jacrev(bounced), **LOOPS)(x)
+    np.testing.assert_allclose(values, exactly(x), atol=1e-11)
+    for slopes in (forward, reverse):
+        np.testing.assert_allclose(slopes, jax.jacfwd(exactly)(x), atol=1e-10)
     load = fj.forces.Payload(fj.Point(1, 1.0), mass=1.5, begin=0.5, end=2.0)
     slows, arm = lambda t, q, qd, linkage: qd[0] - 1, BAR.replace(gravity=0)
     start = fj.State([0.0], [2.0])

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import Push
-from modes import LOOPS, twice
+from modes import LOOPS, hessian, jacobian
 
 import fdof_jax as fj
 from fdof_jax.simulation.jacobian import jacobian_of
@@ -51,12 +51,12 @@ def slopes_in_times():
             x, x[:2], 1e-9,
         ).jacobian  # fmt: skip
 
-    forward = jax.jit(jax.jacfwd(lambda x: end(x, FORWARD), has_aux=True))
+    forward = jacobian(lambda x: end(x, FORWARD))
     reverse = jax.jit(jax.jacrev(lambda x: end(x, adjoint)[0]))
     varied = jax.jit(beside)
 
     def found(x):
-        slope, stats = forward(x)
+        (slope, _), (_, stats) = forward(x)
         return (slope, reverse(x), varied(x)), int(stats["num_rejected_steps"])
 
     return found
@@ -163,7 +163,7 @@ def where_sliders_end(x):
 
 @pytest.fixture(scope="module")
 def slopes_of_sliders():
-    """Second and first derivatives, and the closed forms."""
+    """Second and first derivatives, and values, of motions and of closed forms."""
     ts = jnp.array([0.0, END])
     ends = lambda motion: jnp.concatenate([motion.q[-1], motion.qd[-1]])
     scene = lambda x: fj.Scene(
@@ -174,12 +174,7 @@ def slopes_of_sliders():
         arm, start, forces, _ = scene(x)
         return ends(fj.simulate(arm, start, ts, forces, adjoint=FORWARD))
 
-    def two_and_one(function):
-        first = jax.jacfwd(function)
-        return jax.jacfwd(lambda x: (first(x),) * 2, has_aux=True)
-
-    both, exact = two_and_one(end), two_and_one(where_sliders_end)
-    return jax.jit(lambda x: (*both(x), exact(x)))
+    return hessian(end), hessian(where_sliders_end)
 
 
 @pytest.mark.slow
@@ -192,8 +187,7 @@ def test_derivatives_of_both_orders_at_events_close_together(
     x = [1.0, 1.0, 0.2, 0.2 - 2 * apart, 0.4]  # the second passes 0 that much earlier
     if event == "a known time":
         x[3], x[4] = 0.3, (0.2 + np.sqrt(0.2**2 + 6)) / 3 - apart
-    second, first, exact = slopes_of_sliders(jnp.array(x))
-    for slope, expected in zip((second, first), exact):
+    for slope, expected in zip(*(of(jnp.array(x)) for of in slopes_of_sliders)):
         size = np.abs(expected).max()
         np.testing.assert_allclose(slope, expected, atol=1e-8 * size)
 
@@ -268,7 +262,7 @@ def test_what_a_blow_switches_at_once_switches_at_the_time_of_the_blow():
         return speed * rest - (gravity + 4) * rest**2 / 2
 
     x = jnp.array([1.0, 9.81, 0.9])  # it still rises at the end
-    curves, (forward, _) = twice(lambda x: place(x, adjoint=FORWARD))(x)
+    curves, forward, _ = hessian(lambda x: place(x, adjoint=FORWARD))(x)
     reverse = jax.jit(jax.grad(place), **LOOPS)(x)
     for slopes in (forward, reverse):
         np.testing.assert_allclose(slopes, jax.grad(exactly)(x), atol=1e-9)

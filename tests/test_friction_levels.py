@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from modes import LOOPS, twice
+from modes import LOOPS, hessian, jacobian
 from scipy.integrate import solve_ivp
 
 import fdof_jax as fj
@@ -132,7 +132,7 @@ def test_derivatives_of_stick_slip():
     wanted = (wanted[:, 0] - wanted[:, 1]).T / (2e-5 * FRICTION)
     forward = partial(result, adjoint=diffrax.ForwardMode())
     numbers = jnp.asarray(FRICTION)
-    found = jax.jit(jax.jacfwd(forward), **LOOPS)(numbers)
+    found, _ = jacobian(forward)(numbers)
     np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-7)
     found = jax.jit(jax.jacrev(result), **LOOPS)(numbers)
     np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-7)
@@ -184,7 +184,7 @@ def locked_exactly(x):
 def test_a_clutch_locks_two_discs():
     """With first and second derivatives in the rate, the pace and both inertias."""
     x = jnp.array([3.0, 4.0, 0.5, 0.8])
-    curves, (forward, values) = twice(lambda x: locked(x, **FORWARD))(x)
+    curves, forward, values = hessian(partial(locked, **FORWARD))(x)
     reverse = jax.jit(jax.jacrev(locked), **LOOPS)(x)
     np.testing.assert_allclose(values, locked_exactly(x), rtol=0, atol=1e-10)
     exact = jax.jacfwd(locked_exactly)

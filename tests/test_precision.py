@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from elements import ALL, HOLDING, START, arm
-from modes import LOOPS
+from modes import ADJOINT, LOOPS, jacobian
 
 import fdof_jax as fj
 
@@ -72,25 +72,19 @@ def test_motions_of_arms_in_single_precision():
 @pytest.mark.filterwarnings("ignore:.*double precision")
 def test_derivatives_of_an_arm_in_single_precision():
     """In all modes they are those of an arm in double precision."""
+    short = cast(ARM, np.float32)
 
-    def slope(differentiated, linkage, adjoint):
-        @partial(jax.jit, **LOOPS)
-        @differentiated
-        def end(q):
-            start, spring = fj.State(q, START.qd), (ALL["spring"],)
-            return fj.simulate(linkage, start, TS, spring, adjoint=adjoint).q[-1].sum()
+    def end(q, linkage=short, **options):
+        start, spring = fj.State(q, START.qd), (ALL["spring"],)
+        return fj.simulate(linkage, start, TS, spring, **options).q[-1].sum()
 
-        return end(START.q)
-
-    short, forward = cast(ARM, np.float32), diffrax.ForwardMode()
-    expected = slope(jax.jacfwd, cast(short, np.float64), forward)
-    for differentiated, adjoint in [
-        (jax.jacfwd, forward),
-        (jax.grad, diffrax.RecursiveCheckpointAdjoint()),
-        (jax.grad, diffrax.RecursiveCheckpointAdjoint(checkpoints=100)),
-    ]:
-        found = slope(differentiated, short, adjoint)
-        np.testing.assert_allclose(found, expected, atol=1e-9)
+    forward = partial(end, adjoint=diffrax.ForwardMode())
+    wide = partial(forward, linkage=cast(short, np.float64))
+    expected, _ = jacobian(wide)(START.q)
+    found = [jacobian(forward)(START.q)[0]]
+    for of in (end, partial(end, adjoint=ADJOINT)):
+        found.append(jax.jit(jax.grad(of), **LOOPS)(START.q))
+    np.testing.assert_allclose(found, np.tile(expected, (3, 1)), atol=1e-9)
 
 
 def test_an_arm_in_single_precision_is_named():

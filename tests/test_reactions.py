@@ -180,6 +180,13 @@ def test_mujoco_s_rotors_have_the_same_dynamics_and_reactions(topology):
         np.testing.assert_allclose(reactions[k], [*force, moment], atol=1e-9 * size)
 
 
+@eqx.filter_jit
+def efforts_of_loads(linkage, q, qd, qdd):
+    parts = frames(linkage, q)
+    loads = ACTUATOR.loads(0.0, q, qd, qdd, linkage)
+    return sum(jnp.stack(load.efforts(parts)) for load in loads)
+
+
 @pytest.mark.slow
 @each_topology
 def test_pins_carry_the_actuator(topology):
@@ -188,9 +195,7 @@ def test_pins_carry_the_actuator(topology):
     tau = fj.JointEffort([1.0, -2.0, 0.7])(0.0, q, qd, linkage)
     total = tau + ACTUATOR(0.0, q, qd, linkage)
     qdd = fj.forward_dynamics(linkage, q, qd, total, (ACTUATOR,))
-    loads = ACTUATOR.loads(0.0, q, qd, qdd, linkage)
-    parts = frames(linkage, q)
-    by_loads = sum(np.array(load.efforts(parts)) for load in loads)
+    by_loads = efforts_of_loads(linkage, q, qd, qdd)
     alone = fj.forward_dynamics(linkage, q, qd, tau + by_loads)
     np.testing.assert_allclose(alone, qdd, rtol=1e-9, atol=1e-9 * np.abs(qdd).max())
 

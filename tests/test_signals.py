@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from helpers import Push
 from jax.flatten_util import ravel_pytree
+from modes import ADJOINT, jacobian
 
 import fdof_jax as fj
 from fdof_jax.simulation.jacobian import jacobian_of
@@ -64,11 +65,8 @@ def test_a_loop_answers_as_closed_forms_say(reference, exact):
     numbers, whole = ravel_pytree(reference)
     right = lambda x: np.squeeze(exact(*jax.tree.leaves(whole(x))))
 
-    def motion(x):
-        q = places(whole(x), adjoint=diffrax.ForwardMode())
-        return q, q
-
-    found, q = jax.jit(jax.jacfwd(motion, has_aux=True))(numbers)
+    forward = lambda x: places(whole(x), adjoint=diffrax.ForwardMode())
+    found, q = jacobian(forward)(numbers)
     np.testing.assert_allclose(q, right(numbers), atol=1e-8)
     h = 1e-5
     steps = h * np.eye(numbers.size)
@@ -131,25 +129,18 @@ def test_the_times_of_jumps_past_a_limit_have_derivatives_beside_the_motion():
 
 
 def forward(begin):
-    """Returns the derivative and the value."""
-    twice = lambda begin: (saturating(begin, adjoint=diffrax.ForwardMode()),) * 2
-    return jax.jacfwd(twice, has_aux=True)(begin)
+    """Returns the value and the derivative."""
+    motion = functools.partial(saturating, adjoint=diffrax.ForwardMode())
+    return jax.jvp(motion, (begin,), (1.0,))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("first", [
-    forward, lambda begin: jax.value_and_grad(saturating)(begin)[::-1],
-])  # fmt: skip
+@pytest.mark.parametrize("first", [forward, jax.value_and_grad(saturating)])
 def test_they_have_them_in_all_modes(first):
     """First derivatives forward and by tangents, and second ones over them."""
-
-    def twice(begin):
-        found = first(begin)
-        return found[0], found
-
-    both = jax.jit(jax.jacfwd(twice, has_aux=True))
+    both = jax.jit(lambda begin: jax.jvp(first, (begin,), (1.0,)))
     for begin in (0.1, 0.2, 0.3):
-        curvature, (slope, value) = both(begin)
+        (value, slope), (_, curvature) = both(begin)
         left = 0.5 - begin
         np.testing.assert_allclose(value, 5 * left**2)
         np.testing.assert_allclose([slope, curvature], [-10 * left, 10], rtol=1e-9)
@@ -157,8 +148,7 @@ def test_they_have_them_in_all_modes(first):
 
 @pytest.mark.slow
 def test_the_adjoint_has_them():
-    checkpoints = diffrax.RecursiveCheckpointAdjoint(checkpoints=1024)
-    slope = jax.jit(jax.grad(lambda b: saturating(b, adjoint=checkpoints)))(0.2)
+    slope = jax.jit(jax.grad(lambda b: saturating(b, adjoint=ADJOINT)))(0.2)
     np.testing.assert_allclose(slope, -3, rtol=1e-9)
 
 

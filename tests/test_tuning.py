@@ -101,7 +101,7 @@ def test_history_report_and_text_say_what_happened_and_a_second_call_compiles_no
     assert (np.diff(history.wall_time) > 0).all()
     # The slide's actuator starts saturated, the others never are.
     motion = fj.simulate(scene, np.linspace(0, scene.t1, 1001))
-    demand = demands(scene.forces[0], scene.linkage, motion)[:, 1]
+    demand = eqx.filter_jit(demands)(scene.forces[0], scene.linkage, motion)[:, 1]
     beyond = float(np.mean(np.abs(demand) > scene.forces[0].limit[1]))
     assert 0 < history.saturated[0, 1] == pytest.approx(beyond, abs=3e-3)
     assert (history.saturated[0, [0, 2]] == 0).all()

@@ -41,8 +41,8 @@ def moved(factor, kp, damping, limit, ts):
 @partial(jax.jit, **LOOPS)
 def motion_and_derivative(kp, damping, limit, ts):
     """Returns a motion and its derivatives in the logarithm of the factor."""
-    derivative = jax.jacfwd(moved, has_aux=True)
-    slopes, solution = derivative(1.0, kp, damping, limit, ts)
+    of = lambda factor: moved(factor, kp, damping, limit, ts)
+    _, slopes, solution = jax.jvp(of, (1.0,), (1.0,), has_aux=True)
     return solution, slopes
 
 
