@@ -322,6 +322,22 @@ def test_a_payload_of_all_time_is_a_link_of_more_mass():
 
 
 @pytest.mark.slow
+def test_a_batch_has_derivatives_in_what_its_members_share():
+    drop, heights = SLIDE.replace(gravity=9.81), jnp.array([0.4, 0.5])
+
+    def rebounds(restitution):
+        def rate(height):
+            floor = HardStops(0.0, inf, restitution=restitution)
+            start, forward = fj.State(height[None], jnp.zeros(1)), diffrax.ForwardMode()
+            return run(drop, start, [0, 0.4], floor, adjoint=forward).qd[-1, 0]
+
+        return jax.vmap(rate)(heights)
+
+    slopes = jax.jit(jax.jacfwd(rebounds), **LOOPS)(0.5)
+    np.testing.assert_allclose(slopes, jnp.sqrt(2 * 9.81 * heights), rtol=1e-9)
+
+
+@pytest.mark.slow
 def test_modes_and_topologies_share_one_program_in_a_batch():
     """Members equal single motions."""
     arms = [arm(topology) for topology in ("RRR", "RPR", "PRR", "RPP")]

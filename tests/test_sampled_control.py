@@ -171,6 +171,23 @@ def test_constant_steps_begin_anew_at_samples_and_arrivals():
 
 
 @pytest.mark.slow
+def test_constant_steps_have_derivatives_in_period_and_delay():
+    """The disc's effort of 1 N m begins to act after the delay."""
+
+    def turned(times):
+        period, delay = times
+        return fj.simulate_sampled(
+            DISC, STILL, lambda t, q, qd, linkage: jnp.ones(1), period, 3, delay=delay,
+            stepsize_controller=diffrax.ConstantStepSize(), dt0=0.011,
+            adjoint=diffrax.ForwardMode(),
+        ).q[-1, 0]  # fmt: skip
+
+    slopes = jax.jit(jax.jacfwd(turned), **LOOPS)(jnp.array([0.1, 0.03]))
+    rate = (3 * 0.1 - 0.03) / 2
+    np.testing.assert_allclose(slopes, [3 * rate, -rate], rtol=1e-9)
+
+
+@pytest.mark.slow
 def test_a_sample_sees_what_a_blow_leaves():
     """A load is caught at a sample: the same with and without derivatives."""
     load = fj.forces.Payload(fj.Point(1, along=0), 1.0, 2.0, begin=0.25)  # I doubles

@@ -325,7 +325,8 @@ def _planned_without_errors(
     if scheme.landing is not None:
         # The controller's own grid knows nothing of ends at known times.
         dt0: Any = scheme.dt0
-        plan = plan._replace(t1=plan.t0 + dt0)
+        t0 = constant(plan.t0)  # `landing` adds the derivatives
+        plan = plan._replace(t0=t0, t1=t0 + dt0)
         plan, _, of_landing = scheme.landing.after(a.t, a.end, None, plan, a.landing)
     return plan, judged, None, of_landing
 
