@@ -342,6 +342,25 @@ MUTANTS = {
         "passed_zero = passed.switched",
         f"{RESETS}::test_where_a_reset_leaves_its_condition",
     ),
+    "what follows soon is not seen": Mutant(
+        "steps/landing.py",
+        "short = before & (end < found.soon) & (found.soon < state.overshot)",
+        "short = jnp.zeros((), bool)",
+        "held, two joints",
+    ),
+    "a plain function's switches are not dealt": Mutant(
+        "forces/element.py",
+        "switches.add(values, self.jumping)",
+        "pass",
+        f"{SWITCHES}::test_switches_of_a_plain_function_are_located",
+    ),
+    "places of zeros have derivatives of their own": Mutant(
+        "steps/events.py",
+        "passed = passage(*constant(at))",
+        "passed = passage(*at)",
+        "tests/test_friction_levels.py"
+        "::test_a_later_slip_has_a_time_with_derivatives_in_what_a_function_holds",
+    ),
     "a run ends where its last step does": Mutant(
         "steps/events.py",
         "end, there = at_zero(self.term, t, y, args, which, ended & comes)",
@@ -356,7 +375,7 @@ MUTANTS = {
         "::test_a_jump_that_carries_a_condition_over_its_zero_ends_the_motion_there",
     ),
     "conditions have no direction": Mutant(
-        "steps/conditions.py",
+        "steps/exact_zeros.py",
         "return passed[places] & ((wanted == 0) | (wanted == after[places]))",
         "return passed[places]",
         FIRST_ENDS,
@@ -368,13 +387,13 @@ MUTANTS = {
         FIRST_ENDS,
     ),
     "one Newton step to a zero": Mutant(
-        "steps/conditions.py",
+        "steps/exact_zeros.py",
         "_NEWTON, _CONVERGED = 3, 0.01",
         "_NEWTON, _CONVERGED = 1, 2.0",
         f"{CONDITIONS}::test_a_fall_ends_on_the_floor",
     ),
     "straight to a zero": Mutant(
-        "steps/conditions.py",
+        "steps/exact_zeros.py",
         "middle = _along(y, time / 2, term.vf(t, y, args))",
         "middle = y",
         f"{CONDITIONS}"
@@ -394,7 +413,7 @@ MUTANTS = {
         "[wrong3-beyond a hard stop]",
     ),
     "what a reset turns round goes on": Mutant(
-        "steps/conditions.py",
+        "steps/exact_zeros.py",
         "goes_on = jnp.sign(arrives) * jnp.sign(leaves) > 0",
         "goes_on = leaves < 0",
         EVER_FASTER,

@@ -139,6 +139,27 @@ def test_derivatives_of_stick_slip():
 
 
 @pytest.mark.slow
+def test_a_later_slip_has_a_time_with_derivatives_in_what_a_function_holds():
+    """A held slide at q slips at (q + static / stiffness) / pace."""
+    static = 3.0
+    friction = JointFriction(stribeck(2.0, static=static, speed=0.05))
+
+    def slips(numbers):
+        stiffness, pace = numbers
+        drag = lambda t, q, qd, linkage: stiffness * (pace * t - q)
+        motion = fj.simulate(
+            SLIDE, REST, [0, 0.9, 1.2], (friction, drag), adjoint=diffrax.ForwardMode()
+        )
+        return jnp.stack([motion.events.t[2], motion.q[1, 0]])
+
+    (stiffness, pace) = numbers = np.array([100.0, 0.1])
+    (of_time, of_place), (time, place) = jacobian(slips)(numbers)
+    np.testing.assert_allclose(time, (place + static / stiffness) / pace, rtol=1e-11)
+    wanted = (of_place - np.array([static / stiffness**2, time])) / pace
+    np.testing.assert_allclose(of_time, wanted, rtol=1e-8)
+
+
+@pytest.mark.slow
 def test_a_clutch_stops_a_slide_by_a_friction_over_time():
     """Of 4 t newtons: 1 kg at 1 m/s, from 0.5 m, stops after sqrt(1/2) s."""
     clutch = lambda t, q, qd, linkage: 4 * t

@@ -121,7 +121,7 @@ def test_a_ball_bounces_on_a_table_that_rises():
         return jnp.stack([q, rise + back - 9.81 * since, blow])
 
     x = jnp.array([1.0, 0.5, 0.6])
-    curves, (slopes, values) = twice(bounced)(x)
+    curves, slopes, values = hessian(bounced)(x)
     np.testing.assert_allclose(values, exact(x), atol=1e-12)
     np.testing.assert_allclose(slopes, jax.jacfwd(exact)(x), atol=1e-9)
     np.testing.assert_allclose(curves, jax.hessian(exact)(x), atol=1e-8)

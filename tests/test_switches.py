@@ -16,7 +16,7 @@ import fdof_jax as fj
 from fdof_jax.forces.switches import Switches
 from fdof_jax.steps.looped_dopri8 import LoopedDopri8
 
-FORWARD = diffrax.ForwardMode()
+FORWARD, TANGENTS = diffrax.ForwardMode(), diffrax.RecursiveCheckpointAdjoint()
 # One link, whose programs compile faster.
 ROD = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[0.1])
 CASES = jax.tree.map(lambda *a: np.array(a), LIMITED, CABLE, BUMPER)
@@ -165,6 +165,26 @@ def test_chatter_is_named_and_spoils_no_other_member():
     found = jax.jit(jax.vmap(motion))(jnp.array([0.0, 100.0]))
     assert found.outcome.tolist() == ["successful", "too many switches"]
     assert jnp.isfinite(found.q[0]).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("adjoint", [FORWARD, TANGENTS, ADJOINT])
+def test_switches_of_a_plain_function_are_located(adjoint):
+    """A slide at 1 m/s is braked beyond a level: both are in the function's closure."""
+    slide = fj.Linkage("P", length=[0, 1], com=[[0, 0]], mass=[1], inertia=[1])
+    slide, start = slide.replace(gravity=0.0), fj.State([0.0], [1.0])
+
+    def place(numbers):
+        level, brake = numbers
+        force = lambda t, q, qd, linkage: fj.forces.switch(q - level, -brake, 0.0)
+        motion = fj.simulate(slide, start, [0, 1.0], (force,), adjoint=adjoint)
+        return motion.q[-1, 0], motion.stats["num_switches"]
+
+    derivative = jax.jacfwd if adjoint is FORWARD else jax.grad
+    slopes = jax.jit(derivative(place, has_aux=True), **LOOPS)
+    found, switches = slopes(jnp.array([0.4, 0.5]))
+    assert switches == 1
+    np.testing.assert_allclose(found, [0.5 * 0.6, -(0.6**2) / 2], rtol=1e-10)
 
 
 def test_outside_of_a_solve_a_switch_is_a_choice():

@@ -17,6 +17,7 @@ from ..base.checks import instance, shown
 from ..linkage.fields import Foreign, Part, check_joints, default, optional, sized
 from ..linkage.linkage import Linkage, joints_of
 from ..mechanics.equations import Scalars
+from .switches import Switches
 
 Forces = tuple[Any, ...]  # elements, or callables (t, q, qd, linkage) -> tau
 OwnStates = tuple[PyTree, ...]  # of `StatefulElement`s, in the order of the forces
@@ -88,15 +89,32 @@ class ForeignElement(Foreign, Element):
         """Returns it with the closure of a plain function as leaves, at arguments."""
         if not inspect.isfunction(self.called):
             return self
-        closed = eqx.filter_closure_convert(self.called, *arguments)
-        return _Opened(self.called, closed)
+        jumping: list[bool | None] = []
+
+        def acting(sides: Array | None, *arguments: PyTree) -> tuple[Any, list[Array]]:
+            own = Switches(sides)
+            with own.dealt():
+                effort = self.called(*arguments)
+            jumping[:] = own.jumping
+            return effort, own.values
+
+        eqx.filter_eval_shape(acting, None, *arguments)
+        closed = eqx.filter_closure_convert(acting, jnp.zeros(len(jumping)), *arguments)
+        return _Opened(self.called, closed, tuple(jumping))
 
 
 class _Opened(ForeignElement):
     closed: Callable
+    jumping: tuple[bool | None, ...] = eqx.field(static=True)  # of its switches
 
     def __call__(self, *arguments: Any) -> Any:
-        return self.closed(*arguments)
+        switches, sides = Switches.dealing(), jnp.zeros(len(self.jumping))
+        if switches is not None and (rest := switches.rest()) is not None:
+            sides = rest[: len(self.jumping)]
+        effort, values = self.closed(sides, *arguments)
+        if switches is not None:
+            switches.add(values, self.jumping)
+        return effort
 
 
 def element_of(value: Callable) -> Element:

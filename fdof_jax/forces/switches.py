@@ -63,6 +63,11 @@ class Switches:
         found = [jnp.ravel(g).astype(dtype) for g in self.values]
         return jnp.concatenate(found) if found else jnp.zeros(0, dtype)
 
+    @staticmethod
+    def dealing() -> "Switches | None":
+        """Returns those that are dealt to what is traced now, None outside a solve."""
+        return _DEALING.get()
+
     @contextmanager
     def dealt(self) -> Iterator[None]:
         """Deals out sides to the switches traced in this context."""
@@ -106,7 +111,7 @@ def _chosen(
     g: Array, above: ArrayLike, below: ArrayLike, continuous: bool, unit: ArrayLike = 1
 ) -> Array:
     """As `switch`, of a function that may be tiny, but not in this unit."""
-    switches = _DEALING.get()
+    switches = Switches.dealing()
     side = g if switches is None else switches.side_of(g, continuous, unit)
     return jnp.where(side > 0, above, below)
 

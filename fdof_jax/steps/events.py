@@ -16,8 +16,8 @@ from jaxtyping import PyTree
 
 from ..base.trees import constant
 from ..linkage.fields import Truth
-from .conditions import at_zero, later, met, places_of, sides_after
 from .dopri8 import SHORTEST, DenseOutput
+from .exact_zeros import at_zero, later, met, places_of, sides_after
 from .landing import Found, clearance
 from .switch_derivatives import Event, gained, gained_at_kink, lateness, moved
 from .term import Arguments, Integrated, Term
@@ -280,7 +280,7 @@ class Events(eqx.Module):
         values, checks = _values(*constant((self.term, t0, t1, path, own)))
         brief = h <= jnp.maximum(SHORTEST[t1.dtype], _BRIEF * near)
         at = values, checks, sides, regime.on_zero, regime.sizes, near / h, brief
-        passed = passage(*at)
+        passed = passage(*constant(at))  # of what a plain function holds, too
         # A function that began on its zero has left it, after one or more steps.
         left = jnp.finfo(passed.sizes.dtype).eps ** _ON_ZERO * passed.sizes
         on_zero = last.sizes <= left

@@ -39,7 +39,7 @@ def of_zero(zero: Array, factor: Array) -> Array:
     The factor's own derivatives then enter second derivatives alone.
     """
     # With a tangent per member of a batch, JAX wants the value per member, too.
-    return jnp.where(zero == factor, 0, jnp.zeros_like(factor))
+    return jnp.where(zero > 0, 0, jnp.zeros_like(factor))
 
 
 @of_zero.defjvp
