@@ -122,7 +122,7 @@ MUTANTS = {
     ),
     "not moved back after an event": Mutant(
         "steps/events.py",
-        "there = moved(-late, t + late, there, after, self.term)",
+        "there = moved(-late, end, there, after, self.term)",
         "pass",
         BOUNCES,
     ),
