@@ -25,12 +25,12 @@ class Holder(ScalarElement):
 
     @property
     def holds(self) -> bool:
-        """Whether joints stand exactly still by its law."""
+        """True if joints stand exactly still by its law."""
         return True
 
     @property
     def counted(self) -> bool:
-        """Whether `Solution.taken` has all the energy that it takes."""
+        """True if `Solution.taken` has all the energy that it takes."""
         return self.holds
 
     def levels(self, joints: int, *at: Any) -> tuple[Array, Array]:

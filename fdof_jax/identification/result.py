@@ -71,7 +71,7 @@ class FitResult(Report):
 
     @property
     def usable(self) -> bool:
-        """Whether no fault is known, which says little without held-out recordings."""
+        """True if no fault is known, which says little without held-out recordings."""
         return not self.faults
 
     def _verdict(self) -> list[str]:

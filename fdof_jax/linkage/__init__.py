@@ -1,4 +1,4 @@
-"""What an arm is: links, joints, coordinates, frames, singular arms."""
+"""Arms: links, joints, coordinates, frames, singular arms."""
 
 from .coordinates import State
 from .frames import Frames, link_frames

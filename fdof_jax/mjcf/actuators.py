@@ -143,7 +143,7 @@ def actuators(read: Reader, chain: Chain, controls: ArrayLike | None) -> list[El
 
 
 def _places(model: Model, actuator: int) -> range:
-    """Where an actuator's controls are; newer versions have several of one."""
+    """Places of an actuator's controls, of which newer versions have several."""
     if not hasattr(model, "actuator_ctrladr"):
         return range(actuator, actuator + 1)
     first = int(model.actuator_ctrladr[actuator])

@@ -22,7 +22,7 @@ _TIPS = ("tip", "ee", "tool", "hand", "end_effector")
 
 
 class Chain(NamedTuple):
-    """Where a model's chain is, and what its plane is.
+    """The place of a model's chain, and its plane.
 
     - `joints`: their ids; `names`, `places` (in qpos) and `rates` (in qvel), (n,).
     - `links`: of each body: 0 for the ground, -1 beside the chain.
@@ -63,11 +63,11 @@ class Reader(NamedTuple):
         return getattr(self.model, kind)(int(index)).name or str(int(index))
 
     def has(self, array: str, index: int) -> np.bool_ | bool:
-        """Whether an array, which older versions may lack, is not 0 there."""
+        """Returns whether an array, which older versions may lack, is not 0 there."""
         return hasattr(self.model, array) and np.any(getattr(self.model, array)[index])
 
     def disabled(self, *names: str) -> bool:
-        """Whether a flag of one of these names switches something off."""
+        """Returns whether a flag of one of these names switches something off."""
         flags = self.mujoco.mjtDisableBit.__members__  # some in some versions only
         bits = [int(flags[f"mjDSBL_{n}"]) for n in names if f"mjDSBL_{n}" in flags]
         return any(self.model.opt.disableflags & bit for bit in bits)
@@ -95,7 +95,7 @@ class Reader(NamedTuple):
         return held
 
     def path_of_tendon(self, tendon: int) -> slice:
-        """Where the parts of a tendon's path are."""
+        """Returns the places of the parts of a tendon's path."""
         begin = int(self.model.tendon_adr[tendon])
         return slice(begin, begin + int(self.model.tendon_num[tendon]))
 

@@ -24,7 +24,7 @@ _NEGLIGIBLE = 1e-9
 
 
 class Account(NamedTuple):
-    """What became of each part of a model: a table that prints itself.
+    """A table of what became of each part of a model; prints itself.
 
     - `lines`: pairs of a part, and of what it became or why it was left out.
     """

@@ -37,7 +37,7 @@ def reached(
 
 
 def ending(solution: Solution) -> str:
-    """When and why a motion ended early, for a legend; "" if it did not."""
+    """A legend of when and why a motion ended early; "" if it did not."""
     finite = np.isfinite(np.asarray(solution.q)).all(axis=1)
     if finite.all():
         return ""

@@ -22,7 +22,7 @@ _STANDS = 1e-9  # changes of a reference that are less are none [m or rad]
 
 
 class Response(Report):
-    """How joints followed the reference of their controller; prints itself.
+    """Measures of how joints followed their reference; prints itself.
 
     Overshoot, rise and settling refer to the last position, which a load or friction
     may keep away from the reference. They are NaN for joints whose reference moves

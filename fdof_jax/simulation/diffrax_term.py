@@ -53,10 +53,8 @@ def ode_term(scene: Scene) -> tuple[diffrax.ODETerm, _Y, Args]:
         check_free(name := f"scene.forces[{index}]", element)
         alone = (element,)
         if prescribed(alone) or changes(alone) or conditions_in(alone):
-            expected = (
-                "no PrescribedMotion, Reset, Until or Payload with a begin, which "
-            )
-            raise refusal(name, expected + "only simulate carries out", element)
+            expected = "no PrescribedMotion, Reset, Until or Payload with a begin"
+            raise refusal(name, f"{expected}, as only simulate has them", element)
     q, qd = (without_fixed(linkage, jnp.asarray(value)) for value in start)
     args = args_of(linkage, q, forces)
     y0 = q, qd, jnp.array(initial_own(args), q.dtype)

@@ -137,7 +137,7 @@ def controller_and_others(scene: Scene) -> tuple[PDController, tuple[Element, ..
 
 
 def rest_of(scene: Scene) -> Array:
-    """Where the arm rests at the last set point (n,) [m or rad], or NaN."""
+    """The arm's rest at the last set point (n,) [m or rad], or NaN."""
     reference = controller_of(scene).reference
     last, _ = reference_motion(reference, jnp.asarray(scene.t1), scene.linkage)
     return equilibrium(scene.linkage, last, scene.forces, scene.t1)
@@ -326,7 +326,7 @@ class TunedWithin(Report):
 
     @property
     def met(self) -> Bool[np.ndarray, " limit"]:
-        """Whether each limit is met; margins are lower limits, all others upper."""
+        """Returns whether limits are met: margins are lower limits, others upper."""
         sign = np.where(np.array(self.limit) == _MARGIN, -1, 1)
         return sign * self.reached <= sign * self.allowed
 

@@ -1,4 +1,4 @@
-"""What the page is given of each motion: rows as 32-bit numbers, lines, events."""
+"""Data of each motion for the page: rows as 32-bit numbers, lines, events."""
 
 import base64
 from typing import Any
