@@ -114,22 +114,6 @@ def test_a_bar_comes_to_its_lowest_point_in_the_time_of_an_elliptic_integral():
 
 
 @pytest.mark.slow
-def test_second_derivatives_of_ends_that_only_the_condition_moves():
-    """Of a batch by `jax.hessian`; until its end nothing differs in its members."""
-    level, turn = fj.State([0.0], [0.0]), jnp.array([1.2, 1.0])
-
-    def times(turn):
-        down = lambda turn: Until(lambda t, q, qd, linkage: q[0] + turn)
-        ends = lambda turn: fj.simulate(BAR, level, [0, 9.0], until=down(turn)).end.t
-        return jnp.sum(jax.vmap(ends)(turn))
-
-    accelerates = 3 * BAR.gravity  # qd^2 = 3 g sin(turn)
-    by_turn = lambda turn: jnp.sum((accelerates * jnp.sin(turn)) ** -0.5)
-    exact = jnp.diag(jax.grad(by_turn)(turn))
-    np.testing.assert_allclose(jax.hessian(times)(turn), exact, atol=1e-10)
-
-
-@pytest.mark.slow
 def test_a_thousand_members_of_a_sweep_end_as_each_does_alone():
     rng = np.random.default_rng(0)
     starts = fj.State(rng.uniform(-1.5, 1.5, (1000, 1)), rng.uniform(-3, 3, (1000, 1)))

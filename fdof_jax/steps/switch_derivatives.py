@@ -39,7 +39,7 @@ def of_zero(zero: Array, factor: Array) -> Array:
 
     The factor's own derivatives then enter second derivatives alone.
     """
-    return per_member(jnp.zeros_like(factor), zero)
+    return per_member(jnp.zeros_like(factor), (zero, factor))
 
 
 @of_zero.defjvp
