@@ -16,6 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from .checks import function as checked
+from .configuration import options_of_loops
 from .user_warnings import warn
 
 # JAX knows a function by its identity: each `lambda` of a loop would need a program of
@@ -46,6 +48,7 @@ _DATA = (float, np.floating, int), (float, np.floating)
 _fewer: Counter["_Code"] = Counter()
 
 _T = TypeVar("_T")
+_Function = TypeVar("_Function", bound=Callable)
 
 
 @dataclass(frozen=True)
@@ -89,7 +92,46 @@ class SharedFunction(eqx.Module):
         return returned
 
 
-def sharing_functions(run: Callable[..., _T], **trees: PyTree) -> _T:
+def jit(function: _Function) -> _Function:
+    """Decorates a function to run as one compiled program, like `equinox.filter_jit`.
+
+    Plain functions among the arguments, such as elements or `scene_at` of `fit`, are
+    known by their code, and numbers that they reach are data, as in `simulate`. A
+    `lambda` made anew in a loop then needs no new program, which takes seconds. JAX's
+    transformations go inside, not around it.
+
+    **Raises:** ValueError unless `function` is callable. Its calls warn of the third
+    similar function that needs a program of its own.
+
+    >>> import fdof_jax as fj
+    >>> arm = fj.scenes.fig5().linkage
+    >>> @fj.simulation.jit
+    ... def power(force, qd):
+    ...     return force(0.0, qd, qd, arm) @ qd
+    >>> [float(power(lambda t, q, qd, arm: -k * qd, [1.0, 0, 0])) for k in (1, 2)]  # [W]
+    [-1.0, -2.0]
+    """
+    checked("function", function)
+    program = eqx.filter_jit(
+        function,
+        compiler_options=options_of_loops(),  # pyright: ignore[reportCallIssue]
+    )
+    signature = inspect.signature(function)
+
+    @functools.wraps(program)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        bound = signature.bind(*args, **kwargs)
+
+        def run(*values: PyTree) -> Any:
+            bound.arguments = dict(zip(bound.arguments, values))
+            return program(*bound.args, **bound.kwargs)
+
+        return sharing_functions(run, **bound.arguments)
+
+    return call  # type: ignore[return-value]
+
+
+def sharing_functions(run: Callable[..., _T], /, **trees: PyTree) -> _T:
     """Returns `run(*trees)`, with plain functions in the trees in their shared form.
 
     The third similar callable that needs its own program brings a warning.
