@@ -40,6 +40,8 @@ SAMPLED = "tests/test_sampled_control.py"
 CONDITIONS, RESETS = "tests/test_conditions.py", "tests/test_resets.py"
 EVER_FASTER = f"{RESETS}::test_jumps_that_follow_each_other_ever_faster_are_named[0.1]"
 BOUNCES = f"{HOLDING}::test_a_mass_bounces_to_rest_at_a_known_time"
+BATCHED = "tests/test_batched_rules.py"
+ENDS_MOVED = f"{BATCHED}::test_ends_that_only_the_condition_moves"
 FIRST_ENDS = f"{CONDITIONS}::test_the_first_of_several_ends_it"
 
 MUTANTS = {
@@ -150,6 +152,24 @@ MUTANTS = {
         "middle = _straight(late / 2, y, term.vf(t, y, args))",
         "middle = y",
         f"{HOLDING}::test_second_derivatives_through_a_blow",
+    ),
+    "products alike for all members": Mutant(
+        "steps/switch_derivatives.py",
+        "return per_member(jnp.zeros_like(factor), (zero, factor))",
+        "return per_member(jnp.zeros_like(factor), zero)",
+        f"{BATCHED}::test_a_product_with_zero_is_batched_as_both_factors",
+    ),
+    "kinks alike for all members": Mutant(
+        "steps/switch_derivatives.py",
+        "return per_member(jax.tree.map(jnp.zeros_like, at[1]), (at, changes))",
+        "return jax.tree.map(jnp.zeros_like, at[1])",
+        ENDS_MOVED,
+    ),
+    "inverse inertia alike for all members": Mutant(
+        "mechanics/rates.py",
+        "return per_member(pair, primals)",
+        "return pair",
+        ENDS_MOVED,
     ),
     # Judging steps
     "probe off": Mutant(

@@ -83,15 +83,15 @@ def test_the_recursion_for_any_number_of_joints():
     q = rng.normal(size=5)
     x, _ = fj.paper.to_chain(linkage, q, q)
     e, _, d, _, mu, s, J = vectors(linkage, x)
-    F, H = np.zeros(8, complex), np.zeros(8)
+    first, second = np.zeros(8, complex), np.zeros(8)
     for n in reversed(range(2, 7)):
-        F[n] = s[n] + F[n + 1]
-        H[n] = J[n] + 2 * dot(d[n], F[n + 1]) + H[n + 1]
+        first[n] = s[n] + first[n + 1]
+        second[n] = J[n] + 2 * dot(d[n], first[n + 1]) + second[n + 1]
     turns = dict(enumerate((joint == "R" for joint in topology), start=1))
     M = np.zeros((5, 5))
     for k in range(1, 6):
-        p = F[k + 1] if turns[k] else mu[k + 1] * e[k]
-        h = H[k + 1] if turns[k] else dot(F[k + 1], e[k])
+        p = first[k + 1] if turns[k] else mu[k + 1] * e[k]
+        h = second[k + 1] if turns[k] else dot(first[k + 1], e[k])
         for i in reversed(range(1, k + 1)):
             if i < k:
                 h = h + dot(d[i + 1], p)

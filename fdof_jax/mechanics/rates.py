@@ -14,6 +14,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import PyTree
 
+from ..base.trees import per_member
 from .equations import (
     Constants,
     Directions,
@@ -202,7 +203,8 @@ def _one_loop_sensitivities(
 @_one_loop_sensitivities.defjvp
 def _sensitivities_jvp(primals, tangents):
     plain = lambda function: functools.partial(function, divided)
-    return jax.jvp(functools.partial(_derivatives, plain), primals, tangents)
+    pair = jax.jvp(functools.partial(_derivatives, plain), primals, tangents)
+    return per_member(pair, primals)
 
 
 _sensitivities = jax.jit(_one_loop_sensitivities)  # traced once, not at each use

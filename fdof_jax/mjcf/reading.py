@@ -74,7 +74,8 @@ def from_mjcf(
     - `controls`: of the actuators, in MuJoCo's order and units; by default those of the
       first key frame, or 0.
     - `tip`: name of the site or body that is the tip; by default one named tip, ee,
-      tool, hand or end_effector on the last link, or else its last geom or body.
+      tool, hand or end_effector on the last link, or else the end of its last geom (a
+      capsule or cylinder; the centre of another), or its last body.
     - `drop`: kinds of parts to leave out: "actuators", "armature", "contacts",
       "damping", "equalities", "fluid", "friction", "gravcomp", "limits", "plugins",
       "springs", "tendons".

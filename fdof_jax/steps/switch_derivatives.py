@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import PyTree
 
+from ..base.trees import per_member
 from .term import Arguments, Integrated, Term
 
 
@@ -38,8 +39,7 @@ def of_zero(zero: Array, factor: Array) -> Array:
 
     The factor's own derivatives then enter second derivatives alone.
     """
-    # With a tangent per member of a batch, JAX wants the value per member, too.
-    return jnp.where(zero > 0, 0, jnp.zeros_like(factor))
+    return per_member(jnp.zeros_like(factor), (zero, factor))
 
 
 @of_zero.defjvp
@@ -113,7 +113,7 @@ def gained_at_kink(*at: PyTree, term: Term) -> Integrated:
 
     They are not even traced, which keeps programs short.
     """
-    return jax.tree.map(jnp.zeros_like, at[1])
+    return per_member(jax.tree.map(jnp.zeros_like, at[1]), at)
 
 
 @gained_at_kink.def_jvp
@@ -125,7 +125,7 @@ def _(at, changes, *, term):
 @eqx.filter_custom_jvp
 def _first_order(at, changes, *, term):
     """First derivative along `changes`: only its own derivative matters."""
-    return jax.tree.map(jnp.zeros_like, at[1])
+    return per_member(jax.tree.map(jnp.zeros_like, at[1]), (at, changes))
 
 
 @_first_order.def_jvp

@@ -1,0 +1,50 @@
+"""Second derivatives of batches, through custom rules of derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fdof_jax as fj
+from fdof_jax.steps.switch_derivatives import of_zero
+
+BAR = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[1 / 12])
+SLIDE = fj.Linkage("P", length=[0, 0], com=[[0, 0]], mass=[1], inertia=[1], gravity=0)
+TURNS = jnp.array([1.2, 1.0])
+
+
+@pytest.mark.parametrize("axes", [(0, None), (None, 0)])
+def test_a_product_with_zero_is_batched_as_both_factors(axes):
+    """Whose second derivative is that of z f at z = 0."""
+    both = jax.jit(jax.vmap(of_zero, axes))
+    pair = [2 * TURNS if axis == 0 else jnp.array(3.0) for axis in axes]
+    pair[0] *= 0
+    product = lambda change: jnp.sum(both(*(x + change for x in pair)))
+    assert jax.jacfwd(jax.jacfwd(product))(0.0) == 2 * len(TURNS)
+
+
+@pytest.mark.slow
+def test_ends_that_only_the_condition_moves():
+    """Until its end nothing differs in the members of the batch."""
+    level = fj.State([0.0], [0.0])
+
+    def times(turn):
+        down = lambda turn: lambda t, q, qd, linkage: q[0] + turn
+        ends = lambda turn: fj.simulate(BAR, level, [0, 9.0], until=down(turn)).end.t
+        return jnp.sum(jax.vmap(ends)(turn))
+
+    speed = lambda turn: jnp.sqrt(3 * BAR.gravity * jnp.sin(turn))
+    exact = jnp.diag(jax.grad(lambda turn: jnp.sum(1 / speed(turn)))(TURNS))
+    np.testing.assert_allclose(jax.hessian(times)(TURNS), exact, atol=1e-10)
+
+
+@pytest.mark.slow
+def test_places_where_friction_stops_a_slide():
+    def places(level):
+        start = fj.State([0.0], [3.0])
+        rubs = lambda level: (fj.forces.JointFriction(level),)
+        stops = lambda level: fj.simulate(SLIDE, start, [0, 9.0], rubs(level)).q[-1, 0]
+        return jnp.sum(jax.vmap(stops)(level))
+
+    exact = jnp.diag(9 / TURNS**3)  # of v^2 / (2 level)
+    np.testing.assert_allclose(jax.hessian(places)(TURNS), exact, rtol=1e-9)
