@@ -3,11 +3,11 @@
 import equinox as eqx
 import numpy as np
 import pytest
-from fdof_jax.batches.stacks import unstacked
 from test_tuning import losses_of
 
 import fdof_jax as fj
 from fdof_jax import scenes
+from fdof_jax.tuning.stacks import unstacked
 
 
 class TestEnsembles:

@@ -264,18 +264,7 @@ def place_of(item: object, items: Sequence[object]) -> int:
 
 
 def function(name: str, value: object, expected: str = "a callable") -> Callable:
-    """Returns `value` if it is callable and no class.
-
-    **Arguments:** `name`: the argument's name, and `expected`: what is expected, both
-    for messages.
-
-    **Raises:** ValueError for all else.
-
-    >>> import fdof_jax as fj
-    >>> fj.checks.function("loss", 3.0)
-    Traceback (most recent call last):
-    ValueError: loss: expected a callable, got 3.0.
-    """
+    """Returns `value` if it is callable and no class, or raises ValueError."""
     if callable(value) and not isinstance(value, type):
         return value
     raise refusal(name, expected, value)

@@ -93,23 +93,15 @@ class SharedFunction(eqx.Module):
 
 
 def jit(function: _Function) -> _Function:
-    """Decorates a function to run as one compiled program, like `equinox.filter_jit`.
+    """Decorates a function to run as one compiled program, as `tune` and `fit` do.
 
-    Plain functions among the arguments, such as elements or `scene_at` of `fit`, are
-    known by their code, and numbers that they reach are data, as in `simulate`. A
-    `lambda` made anew in a loop then needs no new program, which takes seconds. JAX's
-    transformations go inside, not around it.
+    It is `equinox.filter_jit` that knows plain functions among the arguments by their
+    code; numbers that they reach are data. Other functions of equal code, such as a
+    `lambda` made anew in a loop, then need no program of their own, which takes
+    seconds. JAX's transformations belong inside the function.
 
-    **Raises:** ValueError unless `function` is callable. Its calls warn of the third
-    similar function that needs a program of its own.
-
-    >>> import fdof_jax as fj
-    >>> arm = fj.scenes.fig5().linkage
-    >>> @fj.simulation.jit
-    ... def power(force, qd):
-    ...     return force(0.0, qd, qd, arm) @ qd
-    >>> [float(power(lambda t, q, qd, arm: -k * qd, [1.0, 0, 0])) for k in (1, 2)]  # [W]
-    [-1.0, -2.0]
+    **Raises:** ValueError unless `function` is callable. Calls warn of the third
+    similar function that needs its own program.
     """
     checked("function", function)
     program = eqx.filter_jit(

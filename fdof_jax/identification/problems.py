@@ -12,18 +12,10 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from .. import Scene, Solution, joint_positions, tip_position
-from ..checks import (
-    check_joints,
-    check_scene,
-    function,
-    instance,
-    real_array,
-    refusal,
-    shown,
-)
+from ..checks import check_scene, function, real_array, refusal, shown
 from ..simulation import sensitivities
 from ..tuning import stacked
-from ..tuning.search import Evaluation, sum_of_squares
+from ..tuning.search import Evaluation, check_solution, sum_of_squares
 
 Named = dict[str, Any]  # parameters by name, as numbers or arrays
 Bounds = Mapping[str, Sequence[ArrayLike]]  # (least, greatest) by name
@@ -140,9 +132,7 @@ def link_ends(scene: Scene, solution: Solution) -> Float[Array, "time link 2"]:
     >>> fj.identification.link_ends(fj.scenes.fig5(), motion)[0].tolist()
     [[1.0, 0.0], [2.0, 0.0], [3.0, 0.0]]
     """
-    instance("scene", scene, Scene)
-    instance("solution", solution, Solution)
-    check_joints("solution", solution, scene.linkage)
+    check_solution(scene, solution)
 
     def ends(q):
         tip = tip_position(scene.linkage, q)

@@ -10,7 +10,14 @@ from jax import Array
 from jaxtyping import Float, PyTree
 from numpy.typing import ArrayLike
 
-from ..base.checks import check_known, function, increasing, instance, real_array
+from ..base.checks import (
+    check_known,
+    function,
+    increasing,
+    instance,
+    real_array,
+    real_numbers,
+)
 from ..forces.element import elements_on
 from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import check_linkage
@@ -90,10 +97,11 @@ def sensitivities(
     function("scene_at", scene_at)
     function("residuals", residuals)
     unknowns = real_array("z", z, (None,))
-    times = real_array("ts", ts, (None,))
+    times = real_numbers("ts", ts, (None,))
     increasing("ts", times)
+    times = jnp.asarray(times)
     check_known("tolerance", tolerance)
-    tolerance = float(real_array("tolerance", tolerance, (), above=0))
+    tolerance = float(real_numbers("tolerance", tolerance, (), above=0))
     tolerance = of_precision(tolerance, max(tolerance, SINGLE_TOLERANCE))
     keywords: dict[str, Any] = dict(
         solver=None,
@@ -112,7 +120,9 @@ def sensitivities(
         linkage, state0, forces, _ = scene
         check_linkage(linkage)
         start = State(*map(jnp.asarray, real_state("state0", state0, linkage)))
-        inputs = Inputs(linkage, start, times, None, elements_on(linkage, forces))
+        inputs = Inputs(
+            linkage, start, jnp.asarray(times), None, elements_on(linkage, forces)
+        )
         solution = integrate(inputs, keywords, derivatives=True, tangents=judge)
         found = residuals(scene, solution)
         return real_array("residuals(scene, solution)", found, (None,)), solution

@@ -113,15 +113,7 @@ def elements_at_door(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
 
 
 def check_scene(name: str, scene: Scene) -> None:
-    """Raises ValueError for shapes and kinds that cannot be simulated.
-
-    **Arguments:** `name`: the argument's name, for messages.
-
-    >>> import fdof_jax as fj
-    >>> fj.checks.check_scene("scene", fj.scenes.fig7()._replace(state0=0.5))  # [rad]
-    Traceback (most recent call last):
-    ValueError: scene.state0: expected a State(q, qd), got 0.5.
-    """
+    """Raises ValueError unless a scene's shapes and kinds can be simulated."""
     instance(name, scene, Scene)
     check_linkage(scene.linkage)
     real_state(f"{name}.state0", scene.state0, scene.linkage)

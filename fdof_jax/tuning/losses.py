@@ -11,29 +11,13 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from .. import (
-    Element,
-    Linkage,
-    PDController,
-    Scene,
-    Solution,
-    Values,
-    field,
-    tip_position,
-)
-from ..checks import (
-    check_joints,
-    check_known,
-    check_scene,
-    function,
-    instance,
-    real_array,
-    refusal,
-)
+from .. import Element, PDController, Scene, Solution, Values, field, tip_position
+from ..checks import check_known, check_scene, function, real_array, refusal
 from ..forces import Part, elements_on
+from ..linkage import Linkage
 from ..references import Reference, reference_of
 from ..simulation import Sensitivities, sensitivities
-from .search import Evaluation, sum_of_squares
+from .search import Evaluation, check_solution, sum_of_squares
 
 SAMPLES = 1001
 # Of steps. Fig 7's mean squared error of the tip is then right to 1e-7 of itself, and
@@ -86,12 +70,6 @@ def with_gains(scene: Scene, gains: Array) -> Scene:
     return with_controller(scene, changed)
 
 
-def _check_motion(scene: Scene, solution: Solution) -> None:
-    instance("scene", scene, Scene)
-    instance("solution", solution, Solution)
-    check_joints("solution", solution, scene.linkage)
-
-
 def tip_errors(scene: Scene, solution: Solution) -> Float[Array, " residual"]:
     """Computes the tip error over time; its squares sum to the mean squared error.
 
@@ -109,7 +87,7 @@ def tip_errors(scene: Scene, solution: Solution) -> Float[Array, " residual"]:
     >>> float((errors**2).sum() ** 0.5)  # rms over the first second [m]
     0.351
     """
-    _check_motion(scene, solution)
+    check_solution(scene, solution)
     deviation = tip_deviation(scene.linkage, tracked_task(scene), solution)
     return deviation.reshape(-1) / solution.ts.size**0.5
 
@@ -143,7 +121,7 @@ def joint_errors(scene: Scene, solution: Solution) -> Float[Array, " residual"]:
     >>> float((errors**2).sum() ** 0.5)  # rms over the first second
     0.097
     """
-    _check_motion(scene, solution)
+    check_solution(scene, solution)
     controller = controller_of(scene)
     commanded = lambda t: controller.schedule(t, scene.linkage)[0]
     errors = solution.q - jax.vmap(commanded)(solution.ts)

@@ -13,8 +13,8 @@ from jax import Array
 from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
-from .. import Scene, simulate
-from ..checks import function, whole_number
+from .. import Scene, Solution, simulate
+from ..checks import check_joints, function, instance, whole_number
 from ..simulation import Sensitivities, jit
 from .stacks import stacked
 
@@ -279,6 +279,11 @@ def check_motion(name: str, scene: Scene, ts: ArrayLike) -> None:
     except RuntimeError as error:
         message = f"{name}: expected one that can be simulated from its start. {error}"
         raise ValueError(message) from error
+
+
+def check_solution(scene: Scene, solution: Solution) -> None:
+    instance("scene", scene, Scene)
+    check_joints("solution", solution, scene.linkage)
 
 
 def sum_of_squares(found: Sensitivities, **facts: Array) -> Evaluation:

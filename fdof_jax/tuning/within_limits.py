@@ -1,6 +1,7 @@
 """Tuning of gains within limits on the response."""
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -386,9 +387,8 @@ def tune_within(
     """
     instance("limits", limits, Limits)
     sized = checked("scene", scene, loss)
-    n = scene.linkage.mass.size
-    rules = dict(shape=(n,), finite=False, broadcast=True, of=f"{n} joints")
-    given = limits.arguments().items()
+    n, given = scene.linkage.mass.size, limits.arguments().items()
+    rules: Any = dict(shape=(n,), finite=False, broadcast=True, of=f"{n} joints")
     limits = Limits(*(real_array(f"limits.{k}", row, **rules) for k, row in given))
     rest_of(scene)  # raises for elements with a state
     box = bounds_of(scene, factor, bounds)
