@@ -32,7 +32,6 @@ from . import (
     checks as checks,
     control,
     forces,
-    identification,
     linkage as linkage,
     paper,
     references,
@@ -55,8 +54,6 @@ from .forces.actuators import LinearActuator
 from .forces.element import Element
 from .forces.joints import JointDamper, JointEffort
 from .forces.points import Point, SpringDamper, Wrench
-from .identification.fitting import fit
-from .identification.result import FitResult
 from .linkage.coordinates import State
 from .linkage.fields import Values, field
 from .linkage.linkage import Linkage
@@ -80,9 +77,10 @@ if TYPE_CHECKING:
     from .viewer.view import view
 
 # Last, as leaves import names from above.
-from . import analysis, data, tuning
+from . import analysis, data, identification, tuning
 from .analysis import joint_reactions, linearize
 from .data import from_mjcf, load, save, to_mjcf, to_pandas, to_xarray
+from .identification import FitResult, fit
 from .tuning import TuneResult, tune
 
 __all__ = [

@@ -8,7 +8,6 @@ from jaxtyping import Float
 from .forces.added_inertia import added_energy, added_inertia, energetic_on, inertial_on
 from .forces.element import Forces
 from .linkage.linkage import Linkage, compiled
-from .linkage.topology import fixed_pairs
 from .mechanics.equations import Constants, equations, link_constants, zeros
 from .mechanics.kinematics import mass_center_velocities, mass_centers
 from .mechanics.rates import losses, rates
@@ -156,7 +155,7 @@ def mass_and_bias(
     m, bias = with_added(added, m), bias + more
     joints = range(len(m.bias))
     matrix = [[m.mass[min(i, j)][abs(i - j)] for j in joints] for i in joints]
-    moves = ~jnp.stack(fixed_pairs(linkage.ef))
+    moves = ~linkage.fixed
     matrix = jnp.where(jnp.outer(moves, moves), jnp.array(matrix), jnp.eye(len(moves)))
     return matrix, jnp.where(moves, bias, 0)
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from fdof_jax import search
+from fdof_jax.tuning import search
 
 
 def test_steps_within_a_box_are_the_least():

@@ -11,7 +11,6 @@ from modes import LOOPS, jacobian
 from scipy.integrate import solve_ivp
 
 import fdof_jax as fj
-from fdof_jax.simulation.jacobian import jacobian_of
 from fdof_jax.steps.looped_dopri8 import LoopedDopri8
 
 SLIDE = fj.Linkage(
@@ -201,7 +200,7 @@ def test_variational_equations_pass_over_nothing():
         found = fj.simulate(SLIDE, start, ts, (Hump(z[0]),), adjoint=forward)
         return found.q[-1]
 
-    varied = lambda z: jacobian_of(
+    varied = lambda z: fj.simulation.sensitivities(
         lambda z: fj.Scene(SLIDE, start, (Hump(z[0]),), ts[-1]),
         lambda scene, motion: motion.q[-1], z, ts,
     )  # fmt: skip

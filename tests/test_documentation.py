@@ -23,9 +23,9 @@ PUBLIC = {
 UNITLESS = {
     "existence_factors", "to_mjcf", "fig3", "fig5", "fig7", "load", "save", "stacked",
     "circle_scenes", "configure", "Condition", "Values", "field", "accepts_scene",
-    "of_kind", "check_joints", "check_known", "check_linkage", "instance",
-    "joint_names", "moving_joints", "one_of", "plain", "real_array", "refusal",
-    "Report", "shown", "whole_number",
+    "of_kind", "check_joints", "check_known", "check_linkage", "check_scene",
+    "function", "instance", "jit", "joint_names", "moving_joints", "one_of", "plain",
+    "real_array", "refusal", "Report", "shown", "whole_number",
 }  # fmt: skip
 # Names that implement something printed in the paper.
 SOURCES = {
@@ -95,6 +95,7 @@ RETURNED_BY = {
     "Modes": "closed_loop_modes",
     "NextMotion": "next_motion",
     "Response": "response",
+    "Sensitivities": "sensitivities",
     "Solution": "simulate",
     "TuneResult": "tune",
     "TunedWithin": "tune_within",

@@ -7,7 +7,7 @@ from test_tuning import losses_of
 
 import fdof_jax as fj
 from fdof_jax import scenes
-from fdof_jax.batches.stacks import unstacked
+from fdof_jax.tuning.stacks import unstacked
 
 
 class TestEnsembles:

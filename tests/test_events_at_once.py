@@ -9,7 +9,6 @@ from helpers import Push
 from modes import LOOPS, hessian, jacobian
 
 import fdof_jax as fj
-from fdof_jax.simulation.jacobian import jacobian_of
 from fdof_jax.steps.zeros import CHECKS, SHARES, passage
 
 SLIDE = fj.Linkage(
@@ -45,7 +44,7 @@ def slopes_in_times():
         return jnp.stack([found.q[-1, 0], found.qd[-1, 0]]), found.stats
 
     def beside(x):
-        return jacobian_of(
+        return fj.simulation.sensitivities(
             lambda x: fj.Scene(SLIDE, rest, pushes(x), 1.0),
             lambda scene, motion: jnp.stack([motion.q[-1, 0], motion.qd[-1, 0]]),
             x, x[:2], 1e-9,
@@ -104,7 +103,7 @@ def both_ways(start, places):
         found = fj.simulate(SLIDE, state, ts, (Marks(places),), adjoint=FORWARD)
         return found.q[-1, 0], found.stats
 
-    varied = jacobian_of(
+    varied = fj.simulation.sensitivities(
         lambda places: fj.Scene(SLIDE, state, (Marks(places),), 0.8),
         lambda scene, solution: solution.q[-1],
         places, ts, 1e-9,

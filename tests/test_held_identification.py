@@ -9,7 +9,6 @@ from jax.flatten_util import ravel_pytree
 from modes import LOOPS, jacobian
 
 import fdof_jax as fj
-from fdof_jax.simulation.jacobian import jacobian_of
 
 ARM = fj.scenes.double_pendulum().linkage
 START = fj.State([0.3, -0.2], [0.0, 0.0])
@@ -34,7 +33,7 @@ def test_derivatives_beside_the_motion_are_those_through_it():
 
     def beside(z):
         angles = lambda _, motion: motion.q.reshape(-1)
-        found = jacobian_of(scene_at, angles, z, jnp.asarray(TS), tolerance=1e-11)
+        found = fj.simulation.sensitivities(scene_at, angles, z, TS, 1e-11)
         return found.residuals, found.jacobian
 
     z = jnp.array([0.3, 0.6, 1.0, 0.2, 0.8])

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
-from fdof_jax import search
 from fdof_jax.identification import result as fit_result
+from fdof_jax.tuning import search
 
 TS = np.linspace(0, 2, 201)
 LENGTH, MASS = np.array([0, 1, 0.8, 0.6]), np.array([3.0, 2.0, 1.0])
@@ -274,9 +274,9 @@ def test_the_parameters_are_as_exact_as_the_noise_lets_them_be(seen, noisy):
 def test_a_fit_that_predicts_another_motion_to_its_noise(noise, noisy):
     found = fj.fit(MIXED, FIRST, TS, noisy[0], noise=noise)
     assert found.usable and "not tested on held-out" in str(found).splitlines()[0]
-    compiled = search._evaluate._cached._cache_size()
+    compiled = search._evaluate.__wrapped__._cached._cache_size()
     judged = fj.fit(MIXED, FIRST, TS, noisy[0], noise=noise, validate=(OTHER, noisy[1]))
-    assert search._evaluate._cached._cache_size() == compiled
+    assert search._evaluate.__wrapped__._cached._cache_size() == compiled
     assert judged.usable and str(judged).startswith("No fault is known, on held-out")
     np.testing.assert_array_equal(judged.covariance, found.covariance)
     predicted = recorded(OTHER(judged.parameters))
@@ -316,9 +316,9 @@ def test_a_search_that_is_stopped_reports_and_compiles_nothing_again(noisy):
     stopped = fj.fit(MIXED, FIRST, TS, noisy[0], report=lines.append, max_steps=1)
     assert stopped.faults == ("the search has not converged",)
     assert len(lines) >= 3 and "sum of squares" in lines[-1]
-    before = search._evaluate._cached._cache_size()
+    before = search._evaluate.__wrapped__._cached._cache_size()
     fj.fit(OTHER, TRUE, TS, 1.01 * noisy[0], noise=0.1, max_steps=1)
-    assert search._evaluate._cached._cache_size() == before
+    assert search._evaluate.__wrapped__._cached._cache_size() == before
 
 
 @pytest.mark.parametrize("noise", [1e-3, None])

@@ -13,7 +13,7 @@ import pytest
 import refusals
 
 import fdof_jax as fj
-from fdof_jax import search
+from fdof_jax.tuning import search
 
 # JAX raises the last one for integers that no array holds.
 MEANT = ValueError, TypeError, ImportError, RuntimeError, OSError, OverflowError

@@ -361,7 +361,7 @@ def test_sweeps_in_a_loop_share_a_program(traces):
 @pytest.mark.slow
 def test_fits_in_a_loop_share_a_program(traces):
     motion = fj.simulate(ROD, TILTED, TS, (fj.JointDamper(2.0),))
-    counted, totals = traces(problems, "jacobian_of"), []
+    counted, totals = traces(problems, "sensitivities"), []
     for k in (2.0, 4.0):
 
         def scene_at(parameters, k=k):

@@ -12,7 +12,6 @@ from jax.flatten_util import ravel_pytree
 from modes import ADJOINT, jacobian
 
 import fdof_jax as fj
-from fdof_jax.simulation.jacobian import jacobian_of
 
 SLIDE = fj.Linkage("P", mass=[1], com=[[0, 0]], inertia=[1], length=[0, 1], gravity=0)
 TS = np.linspace(-0.55, 2.0, 26)  # none at a jump, where differences are none
@@ -119,9 +118,8 @@ def test_the_times_of_jumps_past_a_limit_have_derivatives_beside_the_motion():
     def place(z):
         return fj.simulate(scene_at(z), ts).q[-1, 0]
 
-    beside = jax.jit(
-        lambda z: jacobian_of(scene_at, lambda _, motion: motion.q[-1], z, ts)
-    )
+    last = lambda _, motion: motion.q[-1]
+    beside = jax.jit(lambda z: fj.simulation.sensitivities(scene_at, last, z, ts))
     for times in ([0.1, 9.0], [0.2, 9.0], [0.05, 0.1], [0.05, 0.2]):
         z = jnp.array(times)
         slopes = [(place(z + h) - place(z - h)) / 2e-5 for h in 1e-5 * np.eye(2)]

@@ -8,7 +8,6 @@ import pytest
 from modes import LOOPS
 
 import fdof_jax as fj
-from fdof_jax.simulation.jacobian import jacobian_of
 from fdof_jax.tuning.losses import gain_jacobian, gains_of, tip_errors, with_gains
 
 # The arm of Fig 7 up to its slide, as programs of two joints compile faster. There too
@@ -50,7 +49,7 @@ def scaled(scene, z):
 def tangents(scene, tolerance, ts):
     at = lambda z: scaled(scene, z)
     zero = jnp.zeros(gains_of(scene).size)
-    found = jacobian_of(at, tip_errors, zero, ts, tolerance)
+    found = fj.simulation.sensitivities(at, tip_errors, zero, ts, tolerance)
     gradient = 2 * found.jacobian.T @ found.residuals
     return found.residuals, found.jacobian, gradient
 

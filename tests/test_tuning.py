@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import fdof_jax as fj
-from fdof_jax import scenes, search
+from fdof_jax import scenes
+from fdof_jax.tuning import search
 from fdof_jax.tuning.losses import (
     bounds_of,
     controller_of,
@@ -105,11 +106,11 @@ def test_history_report_and_text_say_what_happened_and_a_second_call_compiles_no
     beyond = float(np.mean(np.abs(demand) > scene.forces[0].limit[1]))
     assert 0 < history.saturated[0, 1] == pytest.approx(beyond, abs=3e-3)
     assert (history.saturated[0, [0, 2]] == 0).all()
-    compiled = search._evaluate._cached._cache_size()
+    compiled = search._evaluate.__wrapped__._cached._cache_size()
     task = fj.CircleTask(center=(-3.9, 2.1), radius=0.6)
     trial = with_changes(scene, kp=1.1 * scene.forces[0].kp, reference=task)
     fj.tune(trial._replace(t1=0.9), factor=3.0, max_steps=1, method="l-bfgs")
-    assert search._evaluate._cached._cache_size() == compiled
+    assert search._evaluate.__wrapped__._cached._cache_size() == compiled
 
 
 @pytest.mark.slow
@@ -164,9 +165,9 @@ class TestTracking:
         losses = [fj.tuning.Tracking(effort=price) for price in (0.0, 1e-2, 1.0)]
         tuned = lambda loss: fj.tune(self.scene, loss=loss, max_steps=15)
         front = [tuned(losses[0])]
-        compiled = search._evaluate._cached._cache_size()
+        compiled = search._evaluate.__wrapped__._cached._cache_size()
         front += map(tuned, losses[1:])
-        assert search._evaluate._cached._cache_size() == compiled
+        assert search._evaluate.__wrapped__._cached._cache_size() == compiled
         for loss, result in zip(losses, front):
             residuals = residuals_of(self.scene, result.gains, loss)
             assert result.loss == pytest.approx(residuals @ residuals, rel=1e-5)

@@ -28,7 +28,6 @@ from ..linkage.linkage import (
     per_joint,
     without_fixed,
 )
-from ..linkage.topology import fixed_pairs
 from ..references.reference import Reference, reference_motion
 from ..simulation.field import has_states, total_effort
 from ..simulation.prescribed import prescribed
@@ -96,7 +95,7 @@ def _rest(
     def efforts(q):
         lacking = _lacking(linkage, forces, q, t)
         # A fixed pair is in equilibrium at 0.
-        return jnp.where(jnp.stack(fixed_pairs(linkage.ef)), -q, -lacking)
+        return jnp.where(linkage.fixed, -q, -lacking)
 
     # Efforts relative to their rounding errors' scale: stiff controllers converge as
     # exactly as soft springs.

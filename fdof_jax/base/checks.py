@@ -4,7 +4,6 @@ Shapes and types are always checked, values only while JAX does not trace them.
 """
 
 import importlib
-import inspect
 import itertools
 import operator
 from collections.abc import Callable, Sequence
@@ -311,24 +310,6 @@ def one_of(name: str, value: object, options: Sequence[Any]) -> Any:
     if plain_value and not isinstance(value, bool) and value in options:
         return options[options.index(value)]
     raise refusal(name, f"one of {tuple(options)}", value)
-
-
-def keywords_as(function: Callable, given: dict[str, Any]) -> dict[str, Any]:
-    """Returns a function's keyword-only arguments: those given, else the defaults.
-
-    Raises TypeError for any other keyword.
-    """
-    allowed = {
-        name: parameter.default
-        for name, parameter in inspect.signature(function).parameters.items()
-        if parameter.kind is parameter.KEYWORD_ONLY
-    }
-    for name in given:
-        if name not in allowed:
-            raise TypeError(
-                f"{name}: expected a keyword among {', '.join(allowed)}, got another."
-            )
-    return allowed | given
 
 
 def optional_package(name: str, extra: str) -> ModuleType:

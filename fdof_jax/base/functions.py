@@ -16,6 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from .checks import function as checked
+from .configuration import options_of_loops
 from .user_warnings import warn
 
 # JAX knows a function by its identity: each `lambda` of a loop would need a program of
@@ -46,6 +48,7 @@ _DATA = (float, np.floating, int), (float, np.floating)
 _fewer: Counter["_Code"] = Counter()
 
 _T = TypeVar("_T")
+_Function = TypeVar("_Function", bound=Callable)
 
 
 @dataclass(frozen=True)
@@ -89,7 +92,38 @@ class SharedFunction(eqx.Module):
         return returned
 
 
-def sharing_functions(run: Callable[..., _T], **trees: PyTree) -> _T:
+def jit(function: _Function) -> _Function:
+    """Decorates a function to run as one compiled program, as `tune` and `fit` do.
+
+    It is `equinox.filter_jit` that knows plain functions among the arguments by their
+    code; numbers that they reach are data. Other functions of equal code, such as a
+    `lambda` made anew in a loop, then need no program of their own, which takes
+    seconds. JAX's transformations belong inside the function.
+
+    **Raises:** ValueError unless `function` is callable. Calls warn of the third
+    similar function that needs its own program.
+    """
+    checked("function", function)
+    program = eqx.filter_jit(
+        function,
+        compiler_options=options_of_loops(),  # pyright: ignore[reportCallIssue]
+    )
+    signature = inspect.signature(function)
+
+    @functools.wraps(program)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        bound = signature.bind(*args, **kwargs)
+
+        def run(*values: PyTree) -> Any:
+            bound.arguments = dict(zip(bound.arguments, values))
+            return program(*bound.args, **bound.kwargs)
+
+        return sharing_functions(run, **bound.arguments)
+
+    return call  # type: ignore[return-value]
+
+
+def sharing_functions(run: Callable[..., _T], /, **trees: PyTree) -> _T:
     """Returns `run(*trees)`, with plain functions in the trees in their shared form.
 
     The third similar callable that needs its own program brings a warning.

@@ -9,7 +9,7 @@ from jax import Array
 from ..linkage.fields import Values, field
 from ..linkage.frames import cross, dot, length_of, plane_vector, scalar_frames
 from ..linkage.linkage import Linkage, joints_of
-from ..linkage.topology import fixed_pairs, real_joints
+from ..linkage.topology import real_joints
 from .element import InertialElement
 from .points import Between, Load, Point, over
 
@@ -79,7 +79,7 @@ class Rotor(InertialElement):
         return before + self.gear * q
 
     def weights(self, linkage):
-        return jnp.where(jnp.stack(fixed_pairs(linkage.ef)), 0, self.inertia)
+        return jnp.where(linkage.fixed, 0, self.inertia)
 
     def loads(self, t, q, qd, qdd, linkage):
         """Returns the rotors' moments on the links that carry them."""

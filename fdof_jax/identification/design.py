@@ -9,13 +9,11 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from ..base.checks import function, instance, real_array, refusal, shown
-from ..base.report import Report
-from ..search import Evaluation, Lanes, Run, check_motion, check_scene, minimise
-from ..simulation.jacobian import jacobian_of
-from ..simulation.scene import Scene
-from ..simulation.simulate import simulate
-from ..simulation.solution import Solution
+from .. import Scene, Solution, simulate
+from ..checks import check_scene, function, instance, real_array, refusal, shown
+from ..data import Report
+from ..simulation import sensitivities
+from ..tuning.search import Evaluation, Lanes, Run, check_motion, minimise
 from .problems import (
     Bounds,
     Named,
@@ -97,7 +95,7 @@ def _lane(z: Array, design: _Design) -> Evaluation:
             seen = jnp.asarray(design.observe(scene, solution))
             return (seen / jnp.broadcast_to(design.noise, seen.shape)).reshape(-1)
 
-        found = jacobian_of(changed, readings, jnp.zeros_like(values), design.ts)
+        found = sensitivities(changed, readings, jnp.zeros_like(values), design.ts)
         information = design.information + found.jacobian.T @ found.jacobian
         errors = jnp.sqrt(jnp.diag(jnp.linalg.inv(information)))
         top = jax.lax.stop_gradient(errors.max())

@@ -1,13 +1,14 @@
 """Identification of a scene's parameters from recordings of its motion."""
 
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.checks import keywords_as, refusal
-from ..search import Evaluation, Lanes, Run, check_motion, minimise
+from ..checks import refusal
+from ..tuning.search import Evaluation, Lanes, Run, check_motion, minimise
 from .problems import (
     Bounds,
     Observe,
@@ -74,7 +75,7 @@ def _longer_and_longer(
 
 
 def _search(
-    scene_at, observed, start, ts, together: bool, *, observe, noise, validate, bounds,
+    together: bool, *, scene_at, start, ts, observed, observe, noise, validate, bounds,
     scale, **search: Any,
 ) -> list[FitResult]:  # fmt: skip
     """Fits all recordings `together` in one result, or each in its own."""
@@ -171,9 +172,9 @@ def fit(
     from the start.
     """
     return _search(
-        scene_at, observed, start, ts, True, observe=observe, noise=noise,
-        validate=validate, bounds=bounds, scale=scale, max_steps=max_steps,
-        report=report,
+        True, scene_at=scene_at, start=start, ts=ts, observed=observed, observe=observe,
+        noise=noise, validate=validate, bounds=bounds, scale=scale,
+        max_steps=max_steps, report=report,
     )[0]  # fmt: skip
 
 
@@ -211,5 +212,7 @@ def fit_each(
         shape = ()
     if 0 in shape[:1] or not shape:
         raise refusal("observed", "recordings along a leading axis", observed)
-    keywords = keywords_as(fit, keywords)
-    return _search([scene_at] * shape[0], observed, start, ts, False, **keywords)
+    of_each = [scene_at] * shape[0]
+    given = inspect.signature(fit).bind(of_each, start, ts, observed, **keywords)
+    given.apply_defaults()
+    return _search(False, **given.arguments)

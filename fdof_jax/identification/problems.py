@@ -11,13 +11,11 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..base.checks import array_of, function, instance, real_array, refusal, shown
-from ..batches.stacks import stacked
-from ..mechanics.kinematics import joint_positions, tip_position
-from ..search import Evaluation, check_scene, sum_of_squares
-from ..simulation.jacobian import jacobian_of
-from ..simulation.scene import Scene
-from ..simulation.solution import Solution, check_joints
+from .. import Scene, Solution, joint_positions, tip_position
+from ..checks import check_scene, function, real_array, refusal, shown
+from ..simulation import sensitivities
+from ..tuning import stacked
+from ..tuning.search import Evaluation, check_solution, sum_of_squares
 
 Named = dict[str, Any]  # parameters by name, as numbers or arrays
 Bounds = Mapping[str, Sequence[ArrayLike]]  # (least, greatest) by name
@@ -134,9 +132,7 @@ def link_ends(scene: Scene, solution: Solution) -> Float[Array, "time link 2"]:
     >>> fj.identification.link_ends(fj.scenes.fig5(), motion)[0].tolist()
     [[1.0, 0.0], [2.0, 0.0], [3.0, 0.0]]
     """
-    instance("scene", scene, Scene)
-    instance("solution", solution, Solution)
-    check_joints("solution", solution, scene.linkage)
+    check_solution(scene, solution)
 
     def ends(q):
         tip = tip_position(scene.linkage, q)
@@ -171,7 +167,7 @@ def lane(z: Array, problem: Problem) -> Evaluation:
         return (weight * misfit).reshape(-1)
 
     scene_at = lambda z: problem.scene_at(problem.unknowns.at(z))
-    found = jacobian_of(scene_at, residuals, z, problem.ts, _TOLERANCE)
+    found = sensitivities(scene_at, residuals, z, problem.ts, _TOLERANCE)
     unweighted = found.residuals / jnp.where(there, weight, 1).reshape(-1)
     successive = there[1:] & there[:-1]
     change = jnp.diff(found.residuals.reshape(weight.shape), axis=0)
@@ -207,10 +203,11 @@ def problems_of(
     """Checks a scene and its recording, or lists of both."""
     numbers = "an array of real numbers"
     try:
-        readings = np.asarray(array_of(observed))
+        readings = np.asarray(observed)
     except Exception as error:  # whatever a value's own conversion raises
         raise refusal(names[1], numbers, observed) from error
-    if readings.dtype.kind not in "iuf":
+    masked = isinstance(observed, np.ma.MaskedArray)  # its mask would be lost
+    if masked or readings.dtype.kind not in "iuf":
         raise refusal(names[1], numbers, observed)
     readings = readings.astype(jnp.result_type(float))
     if np.isinf(readings).any():

@@ -6,8 +6,8 @@ import numpy as np
 import scipy
 from jaxtyping import Float
 
-from ..base.report import Report
-from ..search import Evaluation, Run, held_at_bounds
+from ..data import Report
+from ..tuning.search import Evaluation, Run, held_at_bounds
 from .problems import Named, Problem, Unknowns
 
 # A combination is weak if its standard error exceeds this part of its size.

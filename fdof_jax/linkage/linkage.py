@@ -44,7 +44,7 @@ class Linkage(Frozen):
 
     - `topology`: a letter per pair: R (revolute), P (prismatic) or F (fixed), such as
       "RPR"; or two existence factors per pair. Stored as `ef` (2n,); the attribute
-      `topology` has the letters.
+      `topology` has the letters, `fixed` a bool per pair.
     - `length`: A1, A2, ... of the ground and the moving links (n + 1,) [m].
     - `com`: mass centres, along and across each moving link (n, 2) [m].
     - `mass`: of the moving links (n,) [kg].
@@ -116,6 +116,11 @@ class Linkage(Frozen):
         """The letters of a single linkage with a known topology, such as RPR."""
         return letters(self.ef)
 
+    @property
+    def fixed(self) -> Array:
+        """Whether each pair is fixed (n,), also of a traced linkage."""
+        return jnp.stack(fixed_pairs(self.ef))
+
     def __repr__(self) -> str:
         if np.ndim(self.ef) != 1 or not known(self):
             return super().__repr__()
@@ -181,7 +186,7 @@ def per_joint(name: str, values: ArrayLike, linkage: Linkage) -> Array | np.ndar
 
 def without_fixed(linkage: Linkage, values: Array | np.ndarray) -> Array:
     """Returns values of the joints (..., joint), 0 at fixed pairs."""
-    return jnp.where(jnp.stack(fixed_pairs(linkage.ef)), 0, values)
+    return jnp.where(linkage.fixed, 0, values)
 
 
 _T = TypeVar("_T")

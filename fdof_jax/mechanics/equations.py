@@ -90,7 +90,7 @@ def link_constants(
     """Computes the scalars that `rates` needs, with `q` as reference."""
     revolute, fixed, ends_in_slides = _flags(linkage.ef)
     turns = jnp.stack(real_joints(linkage.ef))
-    q = jnp.where(jnp.stack(fixed_pairs(linkage.ef)), 0, q)
+    q = jnp.where(linkage.fixed, 0, q)
     angle = jnp.where(turns, q, linkage.locked)
     sin, cos = sincos(jnp.concatenate([linkage.base_angle[None], angle]))
     ground, *turned = zip(cos, sin)

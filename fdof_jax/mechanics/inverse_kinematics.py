@@ -13,7 +13,7 @@ from ..base.known_values import at_once
 from ..base.trigonometry import plane_angle
 from ..linkage.frames import cross, dot, frames, length_of, plane_vector, unit_vector
 from ..linkage.linkage import Linkage, check_linkage, joints_of
-from ..linkage.topology import fixed_pairs, real_joints
+from ..linkage.topology import real_joints
 from .equations import Scalars
 
 
@@ -104,8 +104,7 @@ def arm_of(linkage: Linkage, orientation: Array | float | None) -> Arm:
     else:
         # Where the chain is with its joints at 0: what is fixed keeps its shape.
         f = frames(linkage, jnp.zeros_like(linkage.locked))
-        fixed = jnp.stack(fixed_pairs(linkage.ef))
-        place = jnp.argsort(fixed, stable=True)[:wanted]
+        place = jnp.argsort(linkage.fixed, stable=True)[:wanted]
         begins, ends = jnp.append(0, place + 1), jnp.append(place, n)
         turned = f.angle[ends] - f.angle[begins]  # within a rigid part
         end = jnp.append(f.start[1:], f.tip(linkage))

@@ -1,14 +1,16 @@
 """Motion in time: its equations, and what is read from them."""
 
+from ..base.functions import jit
 from .conditions import End, Until
 from .diffrax_term import ode_term
 from .efforts import Efforts
+from .jacobian import Sensitivities, sensitivities
 from .prescribed import PrescribedMotion
 from .scene import accepts_scene
 from .solution import Events
 
 __all__ = [
-    "accepts_scene", "Efforts", "End", "Events", "ode_term", "PrescribedMotion",
-    "Until",
+    "accepts_scene", "Efforts", "End", "Events", "jit", "ode_term", "PrescribedMotion",
+    "Sensitivities", "sensitivities", "Until",
 ]  # fmt: skip
 __dir__ = __all__.copy

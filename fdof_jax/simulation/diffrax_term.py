@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..base.checks import instance, refusal
+from ..forces.element import elements_on
 from ..forces.holders import check_free
 from ..linkage.coordinates import real_state
 from ..linkage.linkage import check_linkage, without_fixed
@@ -15,7 +16,7 @@ from .conditions import conditions_in
 from .field import Args, args_of, initial_own, schedule_of, vector_field, whole
 from .holding import changes
 from .prescribed import prescribed
-from .scene import Scene, with_full_size
+from .scene import Scene
 
 _Y = tuple[Array, Array, Array]  # positions, velocities, states of elements
 
@@ -47,7 +48,8 @@ def ode_term(scene: Scene) -> tuple[diffrax.ODETerm, _Y, Args]:
     """
     instance("scene", scene, Scene)
     check_linkage(scene.linkage)
-    linkage, state0, forces, _ = with_full_size(scene)
+    linkage, state0, *_ = scene
+    forces = elements_on(linkage, scene.forces)
     start = real_state("scene.state0", state0, linkage)
     for index, element in enumerate(forces):
         check_free(name := f"scene.forces[{index}]", element)

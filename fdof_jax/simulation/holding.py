@@ -26,7 +26,7 @@ from ..forces.payload import Payload
 from ..forces.reset import resets_in
 from ..linkage.fields import Truth
 from ..linkage.linkage import Linkage, joints_of
-from ..linkage.topology import fixed_pairs, real_joints
+from ..linkage.topology import real_joints
 from ..mechanics.equations import Constants, Equations, Upper, equations, with_held
 from ..mechanics.rates import efforts_of_fixed
 from ..mechanics.solve import divided, solver_of, times, with_added
@@ -95,7 +95,7 @@ def laws(args: Args, t: Array, *state: Array) -> Laws:
     Without the latter, friction that depends on them counts as almost 0.
     """
     joints = joints_of(args.linkage)
-    fixed = jnp.stack(fixed_pairs(args.linkage.ef))
+    fixed = args.linkage.fixed
     if (moved := args.moved) is not None:
         fixed = fixed | moved
     level, static = jnp.zeros(joints), jnp.zeros(joints)
@@ -239,8 +239,9 @@ def within_stops(forces: Forces, q: Array, linkage: Linkage) -> Truth:
     stops = [e for e in forces if isinstance(e, HardStops)]
     if not stops:
         return True
-    fixed = jnp.stack(fixed_pairs(linkage.ef))
-    inside = [fixed | (q >= e.lower - near) & (q <= e.upper + near) for e in stops]
+    inside = [
+        linkage.fixed | (q >= e.lower - near) & (q <= e.upper + near) for e in stops
+    ]
     return jnp.stack(inside).all()
 
 

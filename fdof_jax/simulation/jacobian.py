@@ -7,26 +7,39 @@ import diffrax
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import PyTree
+from jaxtyping import Float, PyTree
+from numpy.typing import ArrayLike
 
-from ..forces.element import elements
-from ..linkage.coordinates import State
+from ..base.checks import (
+    check_known,
+    function,
+    increasing,
+    instance,
+    real_array,
+    real_numbers,
+)
+from ..forces.element import elements_on
+from ..linkage.coordinates import State, real_state
+from ..linkage.linkage import check_linkage
 from ..steps.derivative_control import TANGENTS, TangentJudge
 from ..steps.tolerances import SINGLE_TOLERANCE, adaptive, of_precision
 from .integrate import Inputs, integrate
 from .scene import Scene
 from .solution import Solution
 
-# Tolerance of each step, and that of its tangents over it. Fig 7's mean squared error
-# of the tip is then right to 1e-7 of itself, and its gradient in six gains too.
-TOLERANCE, _OF_TANGENTS = 1e-5, 300.0
+_OF_TANGENTS = 300.0  # tolerance of tangents over that of the motion
 
 
 class Sensitivities(NamedTuple):
-    """Residuals (m,) and their Jacobian (m, n), with the scene and its motion."""
+    """Residuals and their derivatives, as `sensitivities` returns them.
 
-    residuals: Array
-    jacobian: Array
+    - `residuals` (m,): their values [as the function that computes them].
+    - `jacobian` (m, n): their derivatives in each unknown.
+    - `scene`, `solution`: the scene, and its motion [SI units].
+    """
+
+    residuals: Float[Array, " residual"]
+    jacobian: Float[Array, "residual unknown"]
     scene: Scene
     solution: Solution
 
@@ -46,21 +59,49 @@ def along_each(
     return each(directions)
 
 
-def jacobian_of(
+def sensitivities(
     scene_at: Callable[[Array], Scene],
     residuals: Callable[[Scene, Solution], Array],
-    z: Array,
-    ts: Array,
-    tolerance: float = TOLERANCE,
+    z: ArrayLike,
+    ts: ArrayLike,
+    tolerance: float = 1e-5,
 ) -> Sensitivities:
-    """Computes residuals of a simulated scene and their Jacobian in `z` (n,).
+    """Computes residuals of a simulated scene and their Jacobian in a few unknowns.
 
-    A motion that fails is NaN from then on.
+    Tangents are integrated beside the motion, as in `tune` and `fit`. For least squares
+    of your own, call it in a function that `simulation.jit` compiles.
 
-    **Arguments:** `scene_at`: maps `z` to a scene; `residuals`: maps the scene and its
-    motion at the times `ts` to an array; `tolerance`: relative and absolute tolerance
-    of a step in float64. Tangents have 100 times that, relative to the largest.
+    **Arguments:**
+
+    - `scene_at`: returns the scene at unknowns (n,).
+    - `residuals`: `(scene, solution) -> array` (m,).
+    - `z`: the unknowns (n,).
+    - `ts`: increasing times (time,) [s].
+    - `tolerance`: relative and absolute tolerance of a step in float64. Tangents have
+      300 times that, relative to the largest.
+
+    **Returns:** a `Sensitivities`. A motion that fails is NaN from then on.
+
+    **Raises:** ValueError for malformed arguments.
+
+    >>> import fdof_jax as fj
+    >>> arm, start, *_ = fj.scenes.fig3()
+    >>> @fj.simulation.jit
+    ... def end(damping):
+    ...     damped = lambda z: fj.Scene(arm, start, (fj.JointDamper(z[0]),), 1.0)
+    ...     angles = lambda scene, motion: motion.q[-1]
+    ...     return fj.simulation.sensitivities(damped, angles, damping, [0, 1.0])
+    >>> end([20.0]).jacobian.shape
+    (3, 1)
     """
+    function("scene_at", scene_at)
+    function("residuals", residuals)
+    unknowns = real_array("z", z, (None,))
+    times = real_numbers("ts", ts, (None,))
+    increasing("ts", times)
+    times = jnp.asarray(times)
+    check_known("tolerance", tolerance)
+    tolerance = float(real_numbers("tolerance", tolerance, (), above=0))
     tolerance = of_precision(tolerance, max(tolerance, SINGLE_TOLERANCE))
     keywords: dict[str, Any] = dict(
         solver=None,
@@ -75,11 +116,17 @@ def jacobian_of(
 
     def at(z):
         scene = scene_at(z)
-        start = State(*(jnp.asarray(a, dtype=float) for a in scene.state0))
-        forces = elements("scene.forces", scene.forces)
-        inputs = Inputs(scene.linkage, start, ts, None, forces)
+        instance("scene_at(z)", scene, Scene)
+        linkage, state0, forces, _ = scene
+        check_linkage(linkage)
+        start = State(*map(jnp.asarray, real_state("state0", state0, linkage)))
+        inputs = Inputs(
+            linkage, start, jnp.asarray(times), None, elements_on(linkage, forces)
+        )
         solution = integrate(inputs, keywords, derivatives=True, tangents=judge)
-        return residuals(scene, solution), solution
+        found = residuals(scene, solution)
+        return real_array("residuals(scene, solution)", found, (None,)), solution
 
-    value, slopes, solution = along_each(at, z, jnp.eye(z.size, dtype=z.dtype))
-    return Sensitivities(value, slopes.T, scene_at(z), solution)
+    directions = jnp.eye(unknowns.size, dtype=unknowns.dtype)
+    value, slopes, solution = along_each(at, unknowns, directions)
+    return Sensitivities(value, slopes.T, scene_at(unknowns), solution)

@@ -24,7 +24,6 @@ from ..forces.element import Element, Forces, naming
 from ..linkage.fields import Truth, called
 from ..linkage.joint_numbers import among_joints, numbered, numbers_in
 from ..linkage.linkage import Linkage, joints_of
-from ..linkage.topology import fixed_pairs
 from ..references.reference import EXPECTED, reference_motion
 
 
@@ -61,8 +60,7 @@ class PrescribedMotion(Element):
 
     def prescribes(self, linkage: Linkage) -> Array:
         """Returns whether each joint is prescribed; a fixed pair is not."""
-        fixed = jnp.stack(fixed_pairs(linkage.ef))
-        return self.moved[: joints_of(linkage)] & ~fixed
+        return self.moved[: joints_of(linkage)] & ~linkage.fixed
 
     def at(self, t: Array, linkage: Linkage) -> tuple[Array, Array]:
         return reference_motion(self.reference, t, linkage)

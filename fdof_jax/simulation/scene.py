@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, ParamSpec, Protocol, TypeVar, overload
 from jax import Array
 
 from ..base.checks import refusal
-from ..forces.element import Forces, elements_on
+from ..forces.element import Forces
 from ..linkage.coordinates import State
 from ..linkage.linkage import Linkage
 
@@ -88,7 +88,3 @@ def accepts_scene(
         return function(**own | dict(zip(others, more)), **kwargs)  # type: ignore
 
     return resolved
-
-
-def with_full_size(scene: Scene) -> Scene:
-    return scene._replace(forces=elements_on(scene.linkage, scene.forces))

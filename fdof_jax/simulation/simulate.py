@@ -22,7 +22,7 @@ from ..base.checks import (
     whole_number,
 )
 from ..base.known_values import in_numpy
-from ..forces.element import Element, Forces, OwnStates, elements_on, naming
+from ..forces.element import Element, Forces, OwnStates, elements, elements_on, naming
 from ..linkage.coordinates import State, real_state
 from ..linkage.fields import check_values, jumps_at
 from ..linkage.linkage import Linkage, check_linkage
@@ -33,7 +33,7 @@ from .field import initial_states
 from .holding import leaves_prescribed, within_stops
 from .integrate import Inputs, Settings, faults
 from .prescribed import agrees, prescribed
-from .scene import accepts_scene
+from .scene import Scene, accepts_scene
 from .solution import OUTCOMES, Solution, outcome_numbers
 from .solve import solve
 
@@ -110,6 +110,15 @@ def elements_at_door(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
             jumps_at(place, in_numpy(element))
         single_precision(place, element)
     return adapted
+
+
+def check_scene(name: str, scene: Scene) -> None:
+    """Raises ValueError unless a scene's shapes and kinds can be simulated."""
+    instance(name, scene, Scene)
+    check_linkage(scene.linkage)
+    real_state(f"{name}.state0", scene.state0, scene.linkage)
+    elements(f"{name}.forces", scene.forces)
+    elements_at_door(scene.linkage, scene.forces)
 
 
 def check_elements(forces: Forces, linkage: Linkage, ts: Array) -> None:

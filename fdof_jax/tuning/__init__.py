@@ -1,8 +1,8 @@
 """Gain tuning by gradients."""
 
-from ..batches.stacks import stacked
 from .losses import Tracking, joint_errors, tip_errors
 from .result import TuneResult
+from .stacks import stacked
 from .tuning import tune
 from .within_limits import Limits, TunedWithin, tune_within
 

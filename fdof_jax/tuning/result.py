@@ -7,14 +7,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Bool, Float
 
-from ..base.checks import known
-from ..base.report import Report
-from ..linkage.linkage import Linkage, joint_names, moving_joints
-from ..search import Run, best_of
-from ..simulation.scene import Scene
+from .. import Linkage, Scene
+from ..data import Report
+from ..linkage import joint_names, moving_joints
 from .losses import GainBox, controller_of, with_gains
+from .search import Run, best_of
 
 # Joints with actuators at their limits for a larger share of the time are hardly
 # controlled.
@@ -164,10 +164,11 @@ class TuneResult(Report):
 
     def __repr__(self) -> str:
         """One line, or shapes if values are traced."""
-        if not known(self.histories) or not isinstance(self.loss, float):
+        first = self.histories[0]
+        if isinstance(first.loss, Tracer) or not isinstance(self.loss, float):
             return super().__repr__()
         topology = "".join(name[0] for name in joint_names(self.scene.linkage))
-        first, held = self.histories[0], int(self.at_bound.sum())
+        held = int(self.at_bound.sum())
         return (
             f"TuneResult({topology}, loss {first.loss[0]:.5g} to {self.loss:.5g}, "
             f"{held} of {self.tuned_gains} gains at a bound, {self._outcome})"

@@ -6,17 +6,15 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.checks import one_of, refusal, whole_number
-from ..batches.stacks import unstacked
-from ..linkage.linkage import joint_names
-from ..search import METHODS, Lanes, Row, Run, best_of, check_motion, minimise
-from ..simulation.jacobian import TOLERANCE
-from ..simulation.scene import Scene, with_full_size
+from .. import Scene
+from ..checks import one_of, refusal, whole_number
+from ..linkage import joint_names
 from .losses import (
     SAMPLES,
+    TOLERANCE,
     Loss,
     bounds_of,
-    check_tuned,
+    checked,
     controller_of,
     evaluate_gains,
     gains_of,
@@ -25,6 +23,8 @@ from .losses import (
     with_gains,
 )
 from .result import TuneResult, result_of
+from .search import METHODS, Lanes, Row, Run, best_of, check_motion, minimise
+from .stacks import unstacked
 
 _ENOUGH = 1e-4  # relative decrease of the loss; half of it in the rms error
 # The worst of an ensemble is smoothed to a power mean of this order. With n members it
@@ -35,13 +35,14 @@ _ORDERS = {"mean": 1, "worst": 32}
 def _members(ensemble: Scene, scene: Scene, loss: Loss) -> list[Scene]:
     """Checks `ensemble` of `tune`; its members get the scene's gains."""
     alike = lambda s: (joint_names(s.linkage), type(controller_of(s)).__name__)
-    members = unstacked("ensemble", ensemble)
-    for i, member in enumerate(members):
-        check_tuned(f"ensemble[{i}]", member, loss)
+    members = []
+    for i, each in enumerate(unstacked("ensemble", ensemble)):
+        member = checked(f"ensemble[{i}]", each, loss)
         if alike(member) != alike(scene):
             expected = f"joints and a controller like the scene's, {alike(scene)}"
             raise refusal(f"ensemble[{i}]", expected, alike(member))
-    return [with_gains(member, gains_of(scene)) for member in members]
+        members.append(with_gains(member, gains_of(scene)))
+    return members
 
 
 def _failure(members: list[Scene], first: Row, ensemble: bool) -> ValueError:
@@ -116,10 +117,10 @@ def tune(
         raise ValueError("over: expected an ensemble to take the worst of, got none.")
     starts = whole_number("starts", starts, 1, np.iinfo(np.int32).max)
     draw = np.random.default_rng(whole_number("seed", seed, 0))
-    check_tuned("scene", scene, loss)
+    sized = checked("scene", scene, loss)
     box = bounds_of(scene, factor, bounds)
-    members = [scene] if ensemble is None else _members(ensemble, scene, loss)
-    problem = [(with_full_size(member), loss) for member in members]
+    members = [sized] if ensemble is None else _members(ensemble, scene, loss)
+    problem = [(member, loss) for member in members]
     z, low, high = np.repeat([box.logs()], starts, axis=0).swapaxes(0, 1)
     # The first run starts from the scene's gains, the others at random.
     z[1:] = draw.uniform(low[1:], high[1:])

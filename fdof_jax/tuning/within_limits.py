@@ -1,6 +1,7 @@
 """Tuning of gains within limits on the response."""
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
+from .. import Element, PDController, Scene, Solution, Values, field, simulate
 from ..analysis import (
     closed_loop,
     equilibrium,
@@ -18,23 +20,15 @@ from ..analysis import (
     open_loop,
     step_measures,
 )
-from ..base.checks import instance
-from ..base.known_values import in_numpy
-from ..base.report import Report
-from ..control.pd import PDController
-from ..forces.element import Element
-from ..linkage.fields import Part, Values, check_joints, field, sized
-from ..linkage.linkage import joint_names, joints_of, moving_joints
-from ..references.reference import reference_motion
-from ..search import Evaluation, Lanes, check_motion, check_search, sum_of_squares
-from ..simulation.scene import Scene, with_full_size
-from ..simulation.simulate import simulate
-from ..simulation.solution import Solution
+from ..checks import instance, real_array
+from ..data import Report
+from ..forces import Part
+from ..linkage import joint_names, moving_joints
 from .losses import (
     GainBox,
     Loss,
     bounds_of,
-    check_tuned,
+    checked,
     controller_of,
     demands,
     gain_jacobian,
@@ -45,6 +39,7 @@ from .losses import (
     with_gains,
 )
 from .result import gain_rows, gain_table
+from .search import Evaluation, Lanes, check_motion, check_search, sum_of_squares
 
 # Excesses count by their largest in each span of times and in each band of frequencies:
 # one largest of all would jump between peaks, which a search cannot follow.
@@ -138,8 +133,7 @@ def controller_and_others(scene: Scene) -> tuple[PDController, tuple[Element, ..
 
 def rest_of(scene: Scene) -> Array:
     """The arm's rest at the last set point (n,) [m or rad], or NaN."""
-    reference = controller_of(scene).reference
-    last, _ = reference_motion(reference, jnp.asarray(scene.t1), scene.linkage)
+    last, *_ = controller_of(scene).schedule(jnp.asarray(scene.t1), scene.linkage)
     return equilibrium(scene.linkage, last, scene.forces, scene.t1)
 
 
@@ -170,7 +164,7 @@ def sensitivity(A: Array, B: Array, C: Array) -> Array:
 def measured(scene: Scene, limits: Limits) -> Iterator[tuple[str, str, float, float]]:
     """Measures the motion finely; yields a row of `TunedWithin` per limit."""
     controller, others = controller_and_others(scene)
-    limits = in_numpy(limits)
+    limits = jax.tree.map(np.asarray, limits)
     linkage, t1, rest = scene.linkage, float(scene.t1), rest_of(scene)
     moving, names = moving_joints(linkage), joint_names(linkage)
     of_joint = lambda system, k: system(linkage, rest, controller, k + 1, others, t1)
@@ -216,7 +210,7 @@ def _lane(z: Array, problem: tuple[Scene, Loss, Limits, bool]) -> Evaluation:
         return jnp.concatenate([beyond, residuals_of(loss, scene, solution)])
 
     found = gain_jacobian(z, scene, residuals, _TOLERANCE)
-    count = joints_of(scene.linkage) * (3 * _SPANS + with_margins * _BANDS)
+    count = scene.linkage.mass.size * (3 * _SPANS + with_margins * _BANDS)
     beyond, errors = jnp.split(found.residuals, [count])
     slopes, jacobian = jnp.split(found.jacobian, [count])
     own = found._replace(residuals=errors, jacobian=jacobian)
@@ -392,14 +386,15 @@ def tune_within(
     [True, True]
     """
     instance("limits", limits, Limits)
-    check_tuned("scene", scene, loss)
-    check_joints("limits.", limits, scene.linkage)
+    sized = checked("scene", scene, loss)
+    n, given = scene.linkage.mass.size, limits.arguments().items()
+    rules: Any = dict(shape=(n,), finite=False, broadcast=True, of=f"{n} joints")
+    limits = Limits(*(real_array(f"limits.{k}", row, **rules) for k, row in given))
     rest_of(scene)  # raises for elements with a state
     box = bounds_of(scene, factor, bounds)
     max_steps = check_search(max_steps, report)
-    limits = sized(limits, joints_of(scene.linkage))
     with_margins = bool(np.any(np.asarray(limits.modulus_margin) > 0))
-    problem = with_full_size(scene), loss, limits, with_margins
+    problem = sized, loss, limits, with_margins
     lanes = Lanes(_lane, [[problem]])
     z, value, message = _search(scene, lanes, box, max_steps, report)
     scene = with_gains(scene, jnp.asarray(box.gains(z)))

@@ -13,16 +13,10 @@ from jax import Array
 from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
-from .base.checks import function, instance, whole_number
-from .base.configuration import options_of_loops
-from .base.functions import sharing_functions
-from .batches.stacks import stacked
-from .forces.element import elements
-from .linkage.coordinates import real_state
-from .linkage.linkage import check_linkage
-from .simulation.jacobian import Sensitivities
-from .simulation.scene import Scene
-from .simulation.simulate import elements_at_door, simulate
+from .. import Scene, Solution, simulate
+from ..checks import check_joints, function, instance, whole_number
+from ..simulation import Sensitivities, jit
+from .stacks import stacked
 
 # Greatest change of an unknown in a step: a factor of 7 if unknowns are logarithms.
 _LONGEST_STEP = 2.0
@@ -278,15 +272,6 @@ def minimise(
     return runs
 
 
-def check_scene(name: str, scene: Scene) -> None:
-    """Raises ValueError for shapes and kinds that cannot be simulated."""
-    instance(name, scene, Scene)
-    check_linkage(scene.linkage)
-    real_state(f"{name}.state0", scene.state0, scene.linkage)
-    elements(f"{name}.forces", scene.forces)
-    elements_at_door(scene.linkage, scene.forces)
-
-
 def check_motion(name: str, scene: Scene, ts: ArrayLike) -> None:
     """Raises ValueError with the reason if a scene cannot be simulated over `ts`."""
     try:
@@ -296,6 +281,11 @@ def check_motion(name: str, scene: Scene, ts: ArrayLike) -> None:
         raise ValueError(message) from error
 
 
+def check_solution(scene: Scene, solution: Solution) -> None:
+    instance("scene", scene, Scene)
+    check_joints("solution", solution, scene.linkage)
+
+
 def sum_of_squares(found: Sensitivities, **facts: Array) -> Evaluation:
     """The sum of squared residuals, its gradient and Gauss-Newton's curvature."""
     value, jacobian, *_ = found
@@ -303,14 +293,14 @@ def sum_of_squares(found: Sensitivities, **facts: Array) -> Evaluation:
     return Evaluation(loss, 2 * jacobian.T @ value, curvature, facts)
 
 
-@eqx.filter_jit(compiler_options=options_of_loops())  # pyright: ignore[reportCallIssue]
+@jit
 def _evaluate(
-    evaluate: Evaluate, z: Array | np.ndarray, moving: PyTree, shared: PyTree
+    evaluate: Evaluate, z: Array | np.ndarray, moving: PyTree, problem: PyTree
 ) -> Evaluation:
     """Evaluates lanes along the leading axis of `z` and `moving`."""
 
     def lane(z, moving):
-        return evaluate(z, eqx.combine(moving, shared))
+        return evaluate(z, eqx.combine(moving, problem))
 
     if len(z) > 1:
         return jax.vmap(lane)(z, moving)
@@ -354,9 +344,7 @@ class Lanes:
         def evaluated(lanes: np.ndarray) -> Evaluation:
             there = run[lanes], member[lanes]
             moving = jax.tree.map(lambda a: a[there], self.moving)
-            here = points[lanes]
-            evaluate = lambda shared: _evaluate(self.evaluate, here, moving, shared)
-            found = sharing_functions(evaluate, problem=self.shared)
+            found = _evaluate(self.evaluate, points[lanes], moving, self.shared)
             return jax.tree.map(np.asarray, found)
 
         # Copies fill the last group.

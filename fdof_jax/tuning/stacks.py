@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
-from ..base.checks import instance, refusal, shown
-from ..simulation.scene import Scene
+from .. import Scene
+from ..checks import instance, refusal, shown
 
 _Stacked = TypeVar("_Stacked")
 
