@@ -27,7 +27,7 @@ def leaf_of(place):
     return LEAVES.get(first)
 
 
-@pytest.mark.parametrize("leaf", {*LEAVES.values()})
+@pytest.mark.parametrize("leaf", sorted({*LEAVES.values()}))
 def test_a_leaf_imports_public_names_alone(leaf):
     files = [path for path in FOLDER.rglob("*.py") if leaf_of(path) == leaf]
     assert files
@@ -40,7 +40,7 @@ def test_a_leaf_imports_public_names_alone(leaf):
             assert {*names} <= {*PUBLIC[file].__all__}, (path, names)
 
 
-@pytest.mark.parametrize("leaf", {*LEAVES.values()})
+@pytest.mark.parametrize("leaf", sorted({*LEAVES.values()}))
 def test_rooms_only_show_names_of_a_leaf(leaf):
     shown = set()
     for path in FOLDER.rglob("*.py"):
