@@ -146,7 +146,7 @@ def test_recipes(tmp_path, monkeypatch):
     assert names["found"].success and names["found"].fun < 0.01
     assert names["room"](names["found"].x).min() > -1e-6
     np.testing.assert_allclose(names["slope"], names["difference"], rtol=1e-6)
-    np.testing.assert_allclose(names["robust"].x, [1, 2], rtol=1e-5)
+    np.testing.assert_allclose(names["robust"].x, [1, 2], rtol=1e-4)
     assert names["efforts"].shape == (26, 2) and abs(names["efforts"]).max() <= 12
     assert not names["efforts"][:, 1].any()
     push = names["fj"].forces.EffortHistory(np.linspace(0, 2.5, 26), names["efforts"])

@@ -31,12 +31,7 @@ _OF_TANGENTS = 300.0  # tolerance of tangents over that of the motion
 
 
 class Sensitivities(NamedTuple):
-    """Residuals and their derivatives, as `sensitivities` returns them.
-
-    - `residuals` (m,): their values [as the function that computes them].
-    - `jacobian` (m, n): their derivatives in each unknown.
-    - `scene`, `solution`: the scene, and its motion [SI units].
-    """
+    """Residuals (m,) [as computed], their Jacobian (m, n), the scene and its motion."""
 
     residuals: Float[Array, " residual"]
     jacobian: Float[Array, "residual unknown"]
@@ -83,16 +78,6 @@ def sensitivities(
     **Returns:** a `Sensitivities`. A motion that fails is NaN from then on.
 
     **Raises:** ValueError for malformed arguments.
-
-    >>> import fdof_jax as fj
-    >>> arm, start, *_ = fj.scenes.fig3()
-    >>> @fj.simulation.jit
-    ... def end(damping):
-    ...     damped = lambda z: fj.Scene(arm, start, (fj.JointDamper(z[0]),), 1.0)
-    ...     angles = lambda scene, motion: motion.q[-1]
-    ...     return fj.simulation.sensitivities(damped, angles, damping, [0, 1.0])
-    >>> end([20.0]).jacobian.shape
-    (3, 1)
     """
     function("scene_at", scene_at)
     function("residuals", residuals)
@@ -111,7 +96,6 @@ def sensitivities(
         max_steps=65536,
         progress_meter=diffrax.NoProgressMeter(),
     )
-
     judge = TangentJudge(_OF_TANGENTS * tolerance)
 
     def at(z):
@@ -120,9 +104,7 @@ def sensitivities(
         linkage, state0, forces, _ = scene
         check_linkage(linkage)
         start = State(*map(jnp.asarray, real_state("state0", state0, linkage)))
-        inputs = Inputs(
-            linkage, start, jnp.asarray(times), None, elements_on(linkage, forces)
-        )
+        inputs = Inputs(linkage, start, times, None, elements_on(linkage, forces))
         solution = integrate(inputs, keywords, derivatives=True, tangents=judge)
         found = residuals(scene, solution)
         return real_array("residuals(scene, solution)", found, (None,)), solution
