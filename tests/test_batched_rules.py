@@ -20,6 +20,7 @@ def test_a_product_with_zero_is_batched_as_both_factors(axes):
     pair = [2 * TURNS if axis == 0 else jnp.array(3.0) for axis in axes]
     pair[0] *= 0
     product = lambda change: jnp.sum(both(*(x + change for x in pair)))
+    assert jax.jacfwd(product)(0.0) == jax.jacrev(product)(0.0)
     assert jax.jacfwd(jax.jacfwd(product))(0.0) == 2 * len(TURNS)
 
 
