@@ -97,7 +97,7 @@ _TITLES = {
     "fig3": "A damped triple pendulum, released level, swings down",
     "fig4": "Damping brings the triple pendulum to rest in a few swings",
     "fig5": "An undamped triple pendulum swings through to the other side",
-    "fig6-angles": "The undamped links swing on, never twice alike",
+    "fig6-angles": "The undamped links swing on without a period",
     "fig6-energies": "The links exchange energy; the total stays constant",
     "fig7": "Under PD control the arm sags, and its tip follows the circle too low",
     "topologies": "One arm falls in all seven topologies",

@@ -133,7 +133,7 @@ def energy_profile(
     ts, q, qd = reached(linkage, solution)
     energies = jax.vmap(lambda q, qd: link_energies(linkage, q, qd))(q, qd)
     kinetic, potential = map(np.asarray, energies)
-    quantities = "kinetic energy", "potential energy", "of all links"
+    quantities = "kinetic energy", "potential energy", "energy of all links"
     fig, axes = time_panels(fig, 6.0, [f"{name} [J]" for name in quantities])
     for ax, of_links in zip(axes, (kinetic, potential)):
         for k, values in enumerate(of_links.T, start=1):
