@@ -159,6 +159,12 @@ MUTANTS = {
         "return per_member(jnp.zeros_like(factor), zero)",
         f"{BATCHED}::test_a_product_with_zero_is_batched_as_both_factors",
     ),
+    "first order of kinks alike for all members": Mutant(
+        "steps/switch_derivatives.py",
+        "return per_member(jax.tree.map(jnp.zeros_like, at[1]), at)",
+        "return jax.tree.map(jnp.zeros_like, at[1])",
+        f"{ENDS_MOVED}[forward twice]",
+    ),
     "kinks alike for all members": Mutant(
         "steps/switch_derivatives.py",
         "return per_member(jax.tree.map(jnp.zeros_like, at[1]), (at, changes))",

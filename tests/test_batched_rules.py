@@ -1,5 +1,6 @@
 """Second derivatives of batches, through custom rules of derivatives."""
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,19 +25,38 @@ def test_a_product_with_zero_is_batched_as_both_factors(axes):
     assert jax.jacfwd(jax.jacfwd(product))(0.0) == 2 * len(TURNS)
 
 
+class Turned(fj.Element):
+    """A condition: passes 0 where a bar has turned down by an angle."""
+
+    turn: fj.Values = fj.field((), unit="rad")
+
+    def __call__(self, t, q, qd, linkage):
+        return q[0] + self.turn
+
+
+FORWARD = dict(adjoint=diffrax.ForwardMode())
+MODES = {
+    "hessian": (jax.hessian, {}),
+    "forward twice": (lambda f: jax.jacfwd(jax.jacfwd(f)), FORWARD),
+}
+
+
 @pytest.mark.slow
-def test_ends_that_only_the_condition_moves():
+@pytest.mark.parametrize("mode", MODES)
+def test_ends_that_only_the_condition_moves(mode):
     """Until its end nothing differs in the members of the batch."""
-    level = fj.State([0.0], [0.0])
+    level, (second, options) = fj.State([0.0], [0.0]), MODES[mode]
 
     def times(turn):
-        down = lambda turn: lambda t, q, qd, linkage: q[0] + turn
-        ends = lambda turn: fj.simulate(BAR, level, [0, 9.0], until=down(turn)).end.t
+        def ends(turn):
+            motion = fj.simulate(BAR, level, [0, 9.0], until=Turned(turn), **options)
+            return motion.end.t
+
         return jnp.sum(jax.vmap(ends)(turn))
 
     speed = lambda turn: jnp.sqrt(3 * BAR.gravity * jnp.sin(turn))
     exact = jnp.diag(jax.grad(lambda turn: jnp.sum(1 / speed(turn)))(TURNS))
-    np.testing.assert_allclose(jax.hessian(times)(TURNS), exact, atol=1e-10)
+    np.testing.assert_allclose(second(times)(TURNS), exact, atol=1e-10)
 
 
 @pytest.mark.slow

@@ -97,8 +97,8 @@ def jit(function: _Function) -> _Function:
 
     It is `equinox.filter_jit` that knows plain functions among the arguments by their
     code; numbers that they reach are data. Other functions of equal code, such as a
-    `lambda` made anew in a loop, then need no program of their own: a Jacobian
-    of two joints takes 1 ms instead of 1 s. JAX's transformations belong inside.
+    `lambda` made anew in a loop, then need no program of their own, which takes
+    seconds to compile. JAX's transformations belong inside.
 
     **Raises:** ValueError unless `function` is callable. Calls warn of the third
     similar function that needs its own program.

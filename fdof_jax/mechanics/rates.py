@@ -204,6 +204,7 @@ def _one_loop_sensitivities(
 def _sensitivities_jvp(primals, tangents):
     plain = lambda function: functools.partial(function, divided)
     pair = jax.jvp(functools.partial(_derivatives, plain), primals, tangents)
+    # Not all depends on all: one joint's inertia is the same at any position.
     return per_member(pair, primals)
 
 
