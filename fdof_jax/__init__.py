@@ -35,7 +35,6 @@ from . import (
     linkage as linkage,
     paper,
     references,
-    scenes,
     simulation,
 )
 from .base.configuration import configure
@@ -77,7 +76,7 @@ if TYPE_CHECKING:
     from .viewer.view import view
 
 # Last, as leaves import names from above.
-from . import analysis, data, identification, tuning
+from . import analysis, data, identification, scenes, tuning
 from .analysis import joint_reactions, linearize
 from .data import from_mjcf, load, save, to_mjcf, to_pandas, to_xarray
 from .identification import FitResult, fit

@@ -1,21 +1,27 @@
 """The command line: `fdof-jax` or `python -m fdof_jax`."""
 
 import argparse
+import tempfile
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 
-from . import drawing, plotting, scenes
-from .base.configuration import configure
-from .base.version import __version__
-from .base.whole_files import folder_path
-from .forces.joints import JointDamper
-from .simulation.scene import Scene
-from .simulation.simulate import simulate
-from .simulation.solution import Solution
+from . import (
+    JointDamper,
+    Scene,
+    Solution,
+    __version__,
+    configure,
+    drawing,
+    plotting,
+    scenes,
+    simulate,
+)
+from .checks import refusal
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -43,10 +49,13 @@ def main(arguments: list[str] | None = None) -> None:
     if options.command is None:
         parser.print_help()
         return
+    output = Path(options.output)
     try:  # before anything is computed
-        output = folder_path("--output", options.output)
-    except ValueError as error:
-        parser.error(str(error))
+        output.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=output).close()
+    except OSError as error:
+        expected = f"a folder that can be written ({error.strerror})"
+        parser.error(str(refusal("--output", expected, options.output)))
     matplotlib.use("agg")  # pictures are written, never shown
     configure(x64=True)
     for name, figure in _COMMANDS[options.command]():

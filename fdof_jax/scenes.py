@@ -2,17 +2,19 @@
 
 import numpy as np
 
-from .control.pd import PDController
-from .forces.joints import JointDamper
-from .linkage.coordinates import State
-from .linkage.linkage import Linkage
-from .linkage.topology import TOPOLOGIES
-from .mechanics.inverse_kinematics import inverse_kinematics
+from . import (
+    TOPOLOGIES,
+    CircleTask,
+    JointDamper,
+    Linkage,
+    PDController,
+    Scene as Scene,
+    State,
+    TipTask,
+    inverse_kinematics,
+)
 from .paper import from_chain
-from .references.paths import Ellipse
-from .references.task import CircleTask, TipTask
-from .references.timing import Laps
-from .simulation.scene import Scene as Scene
+from .references import Ellipse, Laps
 
 # Of `circle_scenes`, the common start in chain coordinates B1, th2, B2, th3, B3, th4.
 # From here every topology follows the circle away from its singularities.

@@ -36,9 +36,9 @@ LONGEST = {
 }
 # Doctests that compile much.
 LONG_EXAMPLES = {
-    "fdof_jax.analysis.linearization.closed_loop_modes",
-    "fdof_jax.analysis.linearization.equilibrium",
-    "fdof_jax.analysis.linearization.linearize",
+    "fdof_jax.servo.linearization.closed_loop_modes",
+    "fdof_jax.servo.linearization.equilibrium",
+    "fdof_jax.servo.linearization.linearize",
     "fdof_jax.servo.loops.closed_loop",
     "fdof_jax.servo.loops.margins",
     "fdof_jax.servo.loops.open_loop",

@@ -336,13 +336,13 @@ MUTANTS = {
         "tests/test_chain_elements.py::test_elements_act_alike",
     ),
     "braking is limited as driving is": Mutant(
-        "control/drives.py",
+        "drives.py",
         "right = clip(1 + qd / self.no_load, 0, 1)",
         "right = left",
         "tests/test_drives.py::test_a_speed_limit_in_four_quadrants",
     ),
     "a lag has no time": Mutant(
-        "control/drives.py",
+        "drives.py",
         "return own, (command - own) / self.time_constant",
         "return command, (command - own) / self.time_constant",
         "tests/test_drives.py::test_a_lag_is_an_exponential",

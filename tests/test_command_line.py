@@ -48,15 +48,14 @@ ANSWERS = [
     ("figures --help", 0, "--output"),
     ("square", 2, "invalid choice: 'square'"),
     ("--output", 2, "expected one argument"),
-    ("figures --output file", 2, "--output: expected a folder that can be written, "),
-    ("figures --output file", 2, "got 'file': File exists."),
-    ("figures --output s3://a/b", 2, "a folder on this machine, no address, got 's3:"),
-    ("figures --output file/in/it", 2, "got 'file/in/it': Not a directory."),
+    ("figures --output file", 2, "--output: expected a folder that can be written "),
+    ("figures --output file", 2, "(File exists), got 'file'."),
+    ("figures --output file/in/it", 2, "(Not a directory), got 'file/in/it'."),
 ]
 if os.geteuid() != 0:  # root may write everywhere
     ANSWERS += [
-        ("topologies --output sealed", 2, "got 'sealed': Permission denied"),
-        ("topologies --output sealed/in", 2, "got 'sealed/in': Permission denied"),
+        ("topologies --output sealed", 2, "(Permission denied), got 'sealed'."),
+        ("topologies --output sealed/in", 2, "(Permission denied), got 'sealed/in'."),
     ]
 
 

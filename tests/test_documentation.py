@@ -23,9 +23,10 @@ PUBLIC = {
 UNITLESS = {
     "existence_factors", "to_mjcf", "fig3", "fig5", "fig7", "load", "save", "stacked",
     "circle_scenes", "configure", "Condition", "Values", "field", "accepts_scene",
-    "of_kind", "check_joints", "check_known", "check_linkage", "check_scene",
-    "function", "instance", "jit", "joint_names", "moving_joints", "one_of", "plain",
-    "real_array", "refusal", "Report", "shown", "whole_number",
+    "called", "of_kind", "element_of", "naming", "check_free", "check_joints",
+    "check_known", "check_linkage", "check_scene", "function", "instance", "is_traced",
+    "jit", "joint_names", "joints_of", "moving_joints", "one_of", "plain", "real_array",
+    "real_state", "refusal", "Report", "shown", "whole_number", "without_fixed",
 }  # fmt: skip
 # Names that implement something printed in the paper.
 SOURCES = {

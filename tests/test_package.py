@@ -14,10 +14,11 @@ from mutants import MUTANTS
 
 import fdof_jax as fj
 
-# Folders that import from public rooms alone, as a user does: see test_leaves.py. Each
-# has its leaf, of one or several folders.
-LEAVES = {name: name for name in ("mjcf", "pictures", "servo", "tuning", "viewer")}
-LEAVES["identification"] = "tuning"  # both search
+# Folders and files that import from public rooms alone, as a user does: see
+# test_leaves.py. Each has its leaf, of one or several of them.
+ALONE = "drives", "mjcf", "pictures", "scenes", "servo", "tuning", "viewer"
+LEAVES = {name: name for name in ALONE}
+LEAVES |= {"identification": "tuning", "__main__": "scenes"}  # search; figures
 FOLDER = Path(fj.__file__).parent
 ROOT = Path(__file__).parents[1]
 
@@ -71,8 +72,7 @@ def test_pickles_and_import_errors():
 ROOMS = {
     "base": 0, "linkage": 1, "paper": 2, "mechanics": 2, "forces": 3, "dynamics": 4,
     "references": 4, "control": 5, "steps": 6, "simulation": 7, "batches": 8,
-    "analysis": 8, "scenes": 9, "checks": 10, "data": 10, "drawing": 10,
-    "__init__": 11, "__main__": 12,
+    "analysis": 8, "checks": 10, "data": 10, "drawing": 10, "__init__": 11,
 }  # fmt: skip
 
 
@@ -98,7 +98,7 @@ def test_rooms_import_from_those_below_them_only():
 def test_no_modules_import_each_other():
     """Not within functions either, nor for their types; rooms show names of leaves."""
     modules, graph = {*FOLDER.rglob("*.py")}, {}
-    of_leaf = lambda path: path.relative_to(FOLDER).parts[0] in LEAVES
+    of_leaf = lambda path: path.relative_to(FOLDER).with_suffix("").parts[0] in LEAVES
     for path in modules:
         for line in ast.walk(ast.parse(path.read_text())):
             if isinstance(line, ast.ImportFrom) and line.level:

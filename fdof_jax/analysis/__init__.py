@@ -1,7 +1,11 @@
 """Analysis of configurations and motions."""
 
 from ..dynamics import inertia_ratios
-from .linearization import (
+from .reactions import inertial_parameters, joint_reactions, regressor
+
+# isort: split
+# Last, as `servo` imports names from above.
+from ..servo.linearization import (
     Linearization,
     Modes,
     closed_loop_modes,
@@ -10,10 +14,6 @@ from .linearization import (
     linearize,
     loop_matrices,
 )
-from .reactions import inertial_parameters, joint_reactions, regressor
-
-# isort: split
-# Last, as `servo` imports names from above.
 from ..servo.loops import Margins, bandwidth, closed_loop, margins, open_loop
 from ..servo.measures import Response, response, step_measures
 

@@ -31,7 +31,12 @@ JOINT = "joint"
 
 
 def is_traced(*trees: PyTree) -> bool:
-    """Returns whether a JAX transformation traces any leaf of `trees`."""
+    """Returns whether a JAX transformation traces any leaf of `trees`.
+
+    >>> import fdof_jax as fj
+    >>> fj.checks.is_traced(fj.scenes.fig5())
+    False
+    """
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
 
 

@@ -1,7 +1,11 @@
 """Controllers, feedforward and drives."""
 
 from ..mjcf.law import Activation, Actuators
-from .drives import (
+from .pd import ComputedTorque, GravityFeedforward, PDController, gains_from_frequency
+
+# isort: split
+# Last, as `drives` imports names from above.
+from ..drives import (
     DCMotor,
     Drive,
     FirstOrderLag,
@@ -9,7 +13,6 @@ from .drives import (
     SpeedLimit,
     controller_in,
 )
-from .pd import ComputedTorque, GravityFeedforward, PDController, gains_from_frequency
 
 __all__ = [
     "Activation", "Actuators", "ComputedTorque", "controller_in", "DCMotor", "Drive",

@@ -118,6 +118,7 @@ class _Opened(ForeignElement):
 
 
 def element_of(value: Callable) -> Element:
+    """Returns an element itself, or a callable `(t, q, qd, linkage) -> tau` as one."""
     return value if isinstance(value, Element) else ForeignElement(value)
 
 
@@ -160,7 +161,10 @@ _UNTRACEABLE = (
 
 @contextmanager
 def naming(place: str) -> Iterator[None]:
-    """Adds an element's place, such as `forces[0]`, to messages about its values."""
+    """Adds an element's place, such as `forces[0]`, to messages about its values.
+
+    A context: `with naming("command"): ...`.
+    """
     try:
         yield
     except _UNTRACEABLE as error:

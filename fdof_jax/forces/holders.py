@@ -291,7 +291,11 @@ def holders(forces: Forces) -> tuple[Holder, ...]:
 
 
 def check_free(name: str, element: object) -> None:
-    """Raises ValueError for an element that holds joints, where all must be free."""
+    """Raises ValueError for an element that holds joints, where all must be free.
+
+    >>> import fdof_jax as fj
+    >>> fj.checks.check_free("forces[0]", fj.JointDamper(1.0))
+    """
     if isinstance(element, Holder) and element.holds:
         raise refusal(
             name,

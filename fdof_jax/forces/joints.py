@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from ..base.checks import JOINT
-from ..linkage.fields import Values, each, field, table_over_times
+from ..linkage.fields import Values, each, field
 from ..linkage.linkage import Linkage
 from .element import ScalarElement
 from .switches import switch
@@ -102,7 +102,7 @@ class EffortHistory(ScalarElement):
     tau: Values = field((None, JOINT), unit="N or N m")
 
     def conditions(self):
-        yield from table_over_times(self, "tau", 1)
+        yield from self.over_times("tau", 1)
 
     @property
     def jump_ts(self) -> Array:

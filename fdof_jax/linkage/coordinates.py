@@ -27,7 +27,13 @@ class State(NamedTuple):
 
 
 def real_state(name: str, value: State, linkage: Linkage) -> State:
-    """Returns `value` as a state of the linkage's joints, or raises ValueError."""
+    """Returns `value` as a state of the linkage's joints, or raises ValueError.
+
+    >>> import fdof_jax as fj
+    >>> arm, start, *_ = fj.scenes.double_pendulum()
+    >>> fj.checks.real_state("start", start, arm).q.tolist()
+    [0.5, 0.5]
+    """
     try:
         q, qd = value
     except (TypeError, ValueError, RuntimeError):  # RuntimeError: a deleted array

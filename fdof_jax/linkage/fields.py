@@ -83,7 +83,22 @@ def field(
 
 
 def called(expected: str) -> Any:
-    """Declares a field that is called; `expected` describes it in messages."""
+    """Declares a field that is called, such as a reference or another element.
+
+    **Arguments:** `expected`: describes it in messages.
+
+    **Raises:** the constructor raises ValueError for what is not callable.
+
+    >>> import fdof_jax as fj
+    >>> class Half(fj.Element):
+    ...     of: object = fj.forces.called("a force element")
+    ...     def __call__(self, t, q, qd, linkage):
+    ...         with fj.forces.naming("of"):
+    ...             return fj.forces.element_of(self.of)(t, q, qd, linkage) / 2
+    >>> arm, start, *_ = fj.scenes.double_pendulum()
+    >>> Half(fj.JointEffort([4.0, 2.0]))(0.0, *start, arm).tolist()
+    [2.0, 1.0]
+    """
     return dataclasses.field(metadata={"called": expected})
 
 
@@ -169,6 +184,14 @@ class Part(Frozen, metaclass=_Fields):
         if low is not None and high is not None:
             expected = f"less than {second}"
             yield Condition((low < high).all(), first, expected, (low, high))
+
+    def over_times(self, name: str, least: int) -> Iterator[Condition]:
+        """Yields the conditions that `ts` increases, and a field has a row per time."""
+        ts, rows = vars(self)["ts"], len(vars(self)[name])
+        rising = (ts[1:] > ts[:-1]).all() & (len(ts) >= least)
+        words = "two or more increasing times" if least == 2 else "increasing times"
+        yield Condition(rising, "ts", words, (ts,))
+        yield Condition(len(ts) == rows, name, f"{len(ts)} rows, one per time", (rows,))
 
     def value_of(self, name: str, *arguments: Array) -> Array:
         """Returns a declared array, or what the function in its place returns."""
@@ -321,15 +344,6 @@ def _within(part: Part) -> Iterator[tuple[str, Part]]:
             yield name, value
         elif callable(value) and not isinstance(value, type):
             yield name, Foreign(value)
-
-
-def table_over_times(part: Part, name: str, least: int) -> Iterator[Condition]:
-    """Yields the conditions that `ts` increases, and a field has a row per time."""
-    ts, rows = vars(part)["ts"], len(vars(part)[name])
-    rising = (ts[1:] > ts[:-1]).all() & (len(ts) >= least)
-    words = "two or more increasing times" if least == 2 else "increasing times"
-    yield Condition(rising, "ts", words, (ts,))
-    yield Condition(len(ts) == rows, name, f"{len(ts)} rows, one per time", (rows,))
 
 
 def jumps_at(name: str, part: Part) -> Array | None:

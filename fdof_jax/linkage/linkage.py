@@ -157,7 +157,7 @@ def moving_joints(linkage: Linkage) -> list[int]:
 
 
 def joints_of(linkage: Linkage) -> int:
-    """Returns the number of pairs of joints."""
+    """Returns the number of joints, fixed pairs included."""
     return jnp.size(linkage.ef) // 2
 
 
@@ -184,9 +184,16 @@ def per_joint(name: str, values: ArrayLike, linkage: Linkage) -> Array | np.ndar
     return array
 
 
-def without_fixed(linkage: Linkage, values: Array | np.ndarray) -> Array:
-    """Returns values of the joints (..., joint), 0 at fixed pairs."""
-    return jnp.where(linkage.fixed, 0, values)
+def without_fixed(linkage: Linkage, values: ArrayLike) -> Array:
+    """Returns values (..., n) of the joints with 0 at fixed pairs.
+
+    >>> import fdof_jax as fj
+    >>> links = dict(length=[0, 1, 1], com=[[0, 0]] * 2, mass=[1, 1], inertia=[0, 0])
+    >>> arm = fj.Linkage("RF", **links)
+    >>> fj.linkage.joints_of(arm), fj.linkage.without_fixed(arm, [1.0, 2.0]).tolist()
+    (2, [1.0, 0.0])
+    """
+    return jnp.where(linkage.fixed, 0, jnp.asarray(values))
 
 
 _T = TypeVar("_T")

@@ -2,9 +2,12 @@
 
 from .paths import Ellipse, FigureEight, Line, Path, Spline
 from .reference import Reference, reachable, reference_of
-from .signals import Pulse, Ramp, Step
 from .task import CircleTask, JointMove, SetPoint, TipTask, reach_margin
 from .timing import Laps, Travel
+
+# isort: split
+# Last, as `signals` imports names from above.
+from ..servo.signals import Pulse, Ramp, Step
 
 __all__ = [
     "CircleTask", "Ellipse", "FigureEight", "JointMove", "Laps", "Line", "Path",

@@ -1,1 +1,1 @@
-"""Loops, margins and responses of servos."""
+"""Servos: equilibria, linearisation, loops and margins, test signals, responses."""

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import Linkage
-from ..analysis import loop_matrices
 from ..checks import check_known, instance, one_of
 from ..linkage import joint_names, moving_joints
+from .linearization import loop_matrices
 
 if TYPE_CHECKING:
     import control

@@ -10,12 +10,19 @@ from jax import Array
 from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
-from ..base.checks import is_traced, real_array
-from ..forces.element import StatefulElement, element_of, naming
-from ..forces.switches import clip
-from ..linkage.fields import Condition, Values, called, field
-from ..linkage.linkage import Linkage, joints_of
-from .pd import PDController
+from .checks import is_traced, real_array
+from .control import PDController
+from .forces import (
+    Condition,
+    StatefulElement,
+    Values,
+    called,
+    clip,
+    element_of,
+    field,
+    naming,
+)
+from .linkage import Linkage, joints_of
 
 
 class PIDController(StatefulElement):

@@ -5,10 +5,9 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array
 
-from ..base.checks import JOINT
-from ..linkage.fields import Condition, Values, field, table_over_times
-from ..linkage.linkage import Linkage, joints_of
-from .reference import Reference
+from ..forces import Condition, Values, field
+from ..linkage import Linkage, joints_of
+from ..references import Reference
 
 
 class Step(Reference):
@@ -97,10 +96,10 @@ class Ramp(Reference):
     """
 
     ts: Values = field((None,), unit="s")
-    q: Values = field((None, JOINT), unit="m or rad")
+    q: Values = field((None, "joint"), unit="m or rad")
 
     def conditions(self):
-        yield from table_over_times(self, "q", 2)
+        yield from self.over_times("q", 2)
 
     @property
     def jump_ts(self) -> Array:

@@ -13,26 +13,33 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
-from ..base.checks import check_known, function, instance, real_array, refusal
-from ..control.pd import PDController
-from ..dynamics import bias_force, forward_dynamics
-from ..forces.added_inertia import present
-from ..forces.element import Element, Forces, elements_on
-from ..forces.holders import check_free
-from ..linkage.coordinates import State, real_state
-from ..linkage.linkage import (
+from .. import (
+    Element,
     Linkage,
-    check_linkage,
-    joints_of,
-    moving_joints,
-    per_joint,
-    without_fixed,
+    PDController,
+    Solution,
+    State,
+    bias_force,
+    forward_dynamics,
 )
-from ..references.reference import Reference, reference_motion
-from ..simulation.field import has_states, total_effort
-from ..simulation.prescribed import prescribed
-from ..simulation.scene import accepts_scene
-from ..simulation.solution import Solution, check_joints
+from ..checks import (
+    check_free,
+    check_joints,
+    check_known,
+    check_linkage,
+    function,
+    instance,
+    per_joint,
+    real_array,
+    real_state,
+    refusal,
+)
+from ..forces import elements_on, naming, present
+from ..linkage import joints_of, moving_joints, without_fixed
+from ..references import Reference
+from ..simulation import PrescribedMotion, accepts_scene
+
+Forces = tuple[Any, ...]  # elements, or callables (t, q, qd, linkage) -> tau
 
 # Explicit Runge-Kutta methods of order 4 in 4 stages damp every damped mode if the step
 # size times |eigenvalue| is below this (2.8 for undamped and overdamped modes).
@@ -49,16 +56,30 @@ class Linearization(NamedTuple):
     B: Float[Array, "state joint"]
 
 
-def checked(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
+def _checked(linkage: Linkage, forces: Forces) -> tuple[Element, ...]:
     """Returns the forces as elements, which may have no state and hold no joints."""
     check_linkage(linkage)
     acting = elements_on(linkage, forces)
     for index, element in enumerate(acting):
-        check_free(f"forces[{index}]", element)
-    if has_states(linkage, acting) or prescribed(acting) is not None:
-        expected = "elements without a state of their own and no PrescribedMotion"
-        raise refusal("forces", expected, forces)
+        check_free(name := f"forces[{index}]", element)
+        state = jax.eval_shape(element.initial_state, linkage)
+        if jax.tree.leaves(state) or isinstance(element, PrescribedMotion):
+            expected = "an element without a state of its own and no PrescribedMotion"
+            raise refusal(name, expected, element)
     return acting
+
+
+def _efforts(
+    linkage: Linkage, forces: tuple[Element, ...], t: Array, q: Array, qd: Array
+) -> Array:
+    """Sums the efforts of elements without states [N or N m]."""
+    total = jnp.zeros_like(q)
+    for index, element in enumerate(forces):
+        with naming(name := f"forces[{index}]"):
+            state = element.initial_state(linkage)
+            effort, _ = element.act(t, q, qd, linkage, state)
+        total += real_array(name, effort, q.shape)
+    return total
 
 
 def equilibrium(
@@ -82,7 +103,7 @@ def equilibrium(
     >>> fj.analysis.equilibrium(arm, [-1.0, 0.1, 0.1]).tolist()  # it hangs
     [-1.571, 0.0, 0.0]
     """
-    forces = checked(linkage, forces)
+    forces = _checked(linkage, forces)
     return _rest(linkage, forces, per_joint("q", q, linkage), real_array("t", t, ()))
 
 
@@ -126,7 +147,7 @@ def _lacking(
 ) -> Array:
     """Efforts that the arm needs beside the forces to stay at rest."""
     q, still = without_fixed(linkage, q), jnp.zeros_like(q)
-    acting = total_effort(linkage, forces, t, q, still)
+    acting = _efforts(linkage, forces, t, q, still)
     bias = bias_force(linkage, q, still, present(forces, t))
     return without_fixed(linkage, bias - acting)
 
@@ -152,7 +173,7 @@ def holding_efforts(
     >>> fj.analysis.holding_efforts(arm, [0, 0, 0], (rope,)).tolist()  # lifts the tip
     [29.43, 9.81, 0.0]
     """
-    forces = checked(linkage, forces)
+    forces = _checked(linkage, forces)
     q, t = per_joint("q", q, linkage), real_array("t", t, ())
     return _lacking(linkage, forces, q, t)
 
@@ -181,7 +202,7 @@ def linearize(
     >>> np.sort(abs(np.linalg.eigvals(linear.A)))[::2].tolist()  # modes [rad/s]
     [2.02, 4.744, 7.855]
     """
-    forces = checked(linkage, forces)
+    forces = _checked(linkage, forces)
     q, qd = map(jnp.asarray, real_state("state", state, linkage))
     t = real_array("t", t, ())
     return _linearized(linkage, forces, q, qd, t, jnp.zeros_like(q))
@@ -200,7 +221,7 @@ def _linearized(
 
     def rates(y):
         q, qd, tau = (without_fixed(linkage, part) for part in jnp.split(y, 3))
-        tau = tau + total_effort(linkage, forces, t, q, qd)
+        tau = tau + _efforts(linkage, forces, t, q, qd)
         qdd = forward_dynamics(linkage, q, qd, tau, present(forces, t))
         return jnp.concatenate([qd, qdd])
 
@@ -255,11 +276,11 @@ def loop_matrices(
 
     **Raises:** ValueError for malformed arguments.
     """
-    forces = checked(linkage, forces)
+    forces = _checked(linkage, forces)
     function("controller", controller, "a force element, a PDController for instance")
     (element,) = elements_on(linkage, (controller,))
     check_free("controller", element)
-    if prescribed((element,)) is not None:
+    if isinstance(element, PrescribedMotion):
         raise refusal("controller", "one that computes efforts", controller)
     q, t = per_joint("q", q, linkage), real_array("t", t, ())
     return _loop_matrices(linkage, element, forces, q, t)
@@ -283,7 +304,7 @@ def _loop_matrices(
 
         def displaced(reference):
             def at(time, linkage):
-                position, velocity = reference_motion(reference, time, linkage)
+                position, velocity = map(jnp.asarray, reference(time, linkage))
                 by, rate, growth = change
                 since = time - t
                 position = position + by + since * (rate + since / 2 * growth)
@@ -356,7 +377,7 @@ def closed_loop_modes(linkage: Linkage, forces: Forces, solution: Solution) -> M
     >>> float(modes.longest_step[-1])  # [s]
     0.022
     """
-    forces = checked(linkage, forces)
+    forces = _checked(linkage, forces)
     instance("solution", solution, Solution)
     check_known("solution", linkage, forces, solution)
     if solution.q.ndim != 2:
