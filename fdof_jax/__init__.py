@@ -66,7 +66,7 @@ from .mechanics.kinematics import (
 )
 from .references.task import CircleTask, TipTask
 from .simulation.efforts import joint_efforts
-from .simulation.sampled import simulate_sampled, step
+from .simulation.sampled_control import simulate_sampled, step
 from .simulation.scene import Scene
 from .simulation.simulate import simulate
 from .simulation.solution import Solution

@@ -267,7 +267,7 @@ MUTANTS = {
         f"{HYBRID}::test_a_jump_of_the_velocity_is_a_blow",
     ),
     "a prescribed acceleration moves no other joint": Mutant(
-        "simulation/field.py",
+        "simulation/vector_field.py",
         "        tau = minus(tau, times(m.mass, given))",
         "        pass",
         f"{HYBRID}::test_friction_takes_a_load_along_or_lets_it_slip",
@@ -292,7 +292,7 @@ MUTANTS = {
         f"{SAMPLED}::test_joints_are_held_between_samples",
     ),
     "samples before arrivals": Mutant(
-        "simulation/sampled.py",
+        "simulation/sampled_control.py",
         "acting = *forces, *arrivals, sampler",
         "acting = *arrivals, *forces, sampler",
         f"{SAMPLED}::test_delayed_feedback_follows_its_transition_matrix",
@@ -310,20 +310,20 @@ MUTANTS = {
         f"{SAMPLED}::test_a_sample_sees_what_a_blow_leaves",
     ),
     "a delay of whole periods is less": Mutant(
-        "simulation/sampled.py",
+        "simulation/sampled_control.py",
         "rounding = 4 * float(",
         "rounding = 0 * float(",
         f"{SAMPLED}"
         "::test_a_delay_of_whole_periods_is_known_in_either_precision[float64]",
     ),
     "no command under way is late": Mutant(
-        "simulation/sampling.py",
+        "simulation/sampler.py",
         "acting = under_way[(k - self.late) % len(under_way)]",
         "acting = tau",
         f"{SAMPLED}::test_efforts_are_held_and_come_late",
     ),
     "noise is left out": Mutant(
-        "simulation/sampling.py",
+        "simulation/sampler.py",
         "q, qd = (value + rows[k] for value, rows in zip((q, qd), self.noise))",
         "pass",
         f"{SAMPLED}::test_noise_is_what_the_key_says",
@@ -336,13 +336,13 @@ MUTANTS = {
         "tests/test_chain_elements.py::test_elements_act_alike",
     ),
     "braking is limited as driving is": Mutant(
-        "drives.py",
+        "servo/drives.py",
         "right = clip(1 + qd / self.no_load, 0, 1)",
         "right = left",
         "tests/test_drives.py::test_a_speed_limit_in_four_quadrants",
     ),
     "a lag has no time": Mutant(
-        "drives.py",
+        "servo/drives.py",
         "return own, (command - own) / self.time_constant",
         "return command, (command - own) / self.time_constant",
         "tests/test_drives.py::test_a_lag_is_an_exponential",

@@ -7,7 +7,7 @@ from mpmath import mp
 
 import fdof_jax as fj
 from fdof_jax.mechanics.equations import zeros
-from fdof_jax.simulation.field import args_of, watched_field
+from fdof_jax.simulation.vector_field import args_of, watched_field
 
 
 @jax.jit

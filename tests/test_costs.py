@@ -17,7 +17,7 @@ from fdof_jax.base.checks import is_traced
 from fdof_jax.mechanics.equations import link_constants, zeros
 from fdof_jax.mechanics.rates import rates
 from fdof_jax.simulation.arrays import _packed
-from fdof_jax.simulation.field import Args, schedule_of, vector_field
+from fdof_jax.simulation.vector_field import Args, schedule_of, vector_field
 
 
 def cost(kind, function, *arguments):

@@ -12,9 +12,9 @@ from elements import ALL, HOLDING, PD, Hold, arm
 
 import fdof_jax as fj
 from fdof_jax.forces.element import elements
-from fdof_jax.simulation.field import args_of, element_effort
 from fdof_jax.simulation.formulation import clocks_apart, known_times
 from fdof_jax.simulation.simulate import check_elements
+from fdof_jax.simulation.vector_field import args_of, element_effort
 
 ARM, TS, ZERO = arm("RRR"), jnp.array([0.0, 1.0]), jnp.zeros(3)
 

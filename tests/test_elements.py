@@ -17,14 +17,14 @@ from test_costs import flops
 import fdof_jax as fj
 from fdof_jax.forces.added_inertia import added_inertia
 from fdof_jax.mechanics.equations import link_constants, zeros
-from fdof_jax.simulation.field import (
+from fdof_jax.simulation.simulate import check_elements
+from fdof_jax.simulation.vector_field import (
     Args,
     applied,
     initial_own,
     schedule_of,
     vector_field,
 )
-from fdof_jax.simulation.simulate import check_elements
 
 ARM = elements.arm("RPR")
 EVERY = elements.ALL | elements.HOLDING

@@ -23,7 +23,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 import fdof_jax as fj
-from fdof_jax.drives import DriveState
+from fdof_jax.servo.drives import DriveState
 
 SCENE, ARM = fj.scenes.fig7(), fj.scenes.fig5().linkage
 

@@ -16,7 +16,7 @@ import fdof_jax as fj
 
 # Folders and files that import from public rooms alone, as a user does: see
 # test_leaves.py. Each has its leaf, of one or several of them.
-ALONE = "drives", "mjcf", "pictures", "scenes", "servo", "tuning", "viewer"
+ALONE = "mjcf", "pictures", "scenes", "servo", "tuning", "viewer"
 LEAVES = {name: name for name in ALONE}
 LEAVES |= {"identification": "tuning", "__main__": "scenes"}  # search; figures
 FOLDER = Path(fj.__file__).parent

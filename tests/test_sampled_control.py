@@ -11,7 +11,7 @@ from elements import SHORT as STEPS
 from modes import LOOPS, jacobian
 
 import fdof_jax as fj
-from fdof_jax.simulation.sampled import _in_periods
+from fdof_jax.simulation.sampled_control import _in_periods
 
 # I qdd = tau.
 DISC = fj.Linkage(

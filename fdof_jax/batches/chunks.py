@@ -28,12 +28,12 @@ from ..forces.added_inertia import present
 from ..forces.element import elements
 from ..forces.holders import holders
 from ..linkage.topology import real_joints
-from ..simulation.field import total_effort
 from ..simulation.integrate import Inputs, Settings
 from ..simulation.scene import Scene
 from ..simulation.simulate import elements_at_door
 from ..simulation.solution import Solution
 from ..simulation.solve import solve as solve_motion
+from ..simulation.vector_field import total_effort
 from ..steps.tolerances import by_square_roots, default_controller
 from .devices import (
     Device,

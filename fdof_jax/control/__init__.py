@@ -5,7 +5,7 @@ from .pd import ComputedTorque, GravityFeedforward, PDController, gains_from_fre
 
 # isort: split
 # Last, as `drives` imports names from above.
-from ..drives import (
+from ..servo.drives import (
     DCMotor,
     Drive,
     FirstOrderLag,

@@ -29,7 +29,7 @@ _PACKAGE = __name__.partition(".")[0]
 # the states of drives and the histories of tuning are in no room's list.
 _PLACES = (
     "forces control references simulation analysis tuning identification "
-    "drives tuning.result".split()
+    "servo.drives tuning.result".split()
 )
 _NOT_FINITE = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
 _WORDS = _PACKAGE, "value", "tuple", "dict"  # names in files that are of no class

@@ -1,1 +1,1 @@
-"""Servos: equilibria, linearisation, loops and margins, test signals, responses."""
+"""Servos: drives, linearisation about rest, loops, margins, signals, responses."""

@@ -1,13 +1,13 @@
 """Motion in time: its equations, and what is read from them."""
 
 from ..base.functions import jit
-from .conditions import End, Until
 from .diffrax_term import ode_term
 from .efforts import Efforts
 from .jacobian import Sensitivities, sensitivities
 from .prescribed import PrescribedMotion
 from .scene import accepts_scene
 from .solution import Events
+from .until import End, Until
 
 __all__ = [
     "accepts_scene", "Efforts", "End", "Events", "jit", "ode_term", "PrescribedMotion",

@@ -11,7 +11,7 @@ from jax import Array
 
 from ..mechanics.equations import Constants
 from ..steps.term import Integrated, ScheduledTerm
-from .field import Args
+from .vector_field import Args
 
 
 class _Packed(eqx.Module):

@@ -12,11 +12,11 @@ from ..forces.element import elements_on
 from ..forces.holders import check_free
 from ..linkage.coordinates import real_state
 from ..linkage.linkage import check_linkage, without_fixed
-from .conditions import conditions_in
-from .field import Args, args_of, initial_own, schedule_of, vector_field, whole
 from .holding import changes
 from .prescribed import prescribed
 from .scene import Scene
+from .until import conditions_in
+from .vector_field import Args, args_of, initial_own, schedule_of, vector_field, whole
 
 _Y = tuple[Array, Array, Array]  # positions, velocities, states of elements
 

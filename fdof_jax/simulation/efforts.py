@@ -13,21 +13,21 @@ from ..base.checks import is_traced, place_of, refusal
 from ..base.functions import sharing_functions
 from ..forces.element import Element, Forces, ScalarElement, elements_on
 from ..linkage.linkage import Linkage, check_linkage, without_fixed
-from .field import element_effort, with_states
 from .holding import changes, efforts_of_holders
 from .prescribed import prescribed, prescribed_effort
 from .scene import accepts_scene
 from .simulate import check_own
 from .solution import Solution, check_joints
 from .solve import cut, padded
+from .vector_field import element_effort, with_states
 
 
 class Efforts(NamedTuple):
     """Joint efforts along a motion, 0 at fixed pairs [N or N m].
 
-    - `total`: sum over all force elements (time, n).
-    - `elements`: those of each element (element, time, n), without weights of added
-      masses.
+    - `total`: the sum of `elements` (time, n).
+    - `elements`: those of each element (element, time, n), also to hold joints or to
+      prescribe their motion, but without weights of added masses.
     """
 
     total: Float[Array, "time joint"]

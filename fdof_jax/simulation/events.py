@@ -16,7 +16,6 @@ from ..mechanics.equations import Scalars
 from ..mechanics.solve import minus
 from ..steps.switch_derivatives import Event
 from ..steps.term import Integrated
-from .field import Args, efforts, schedule_of, vector_field, with_prescribed_rates
 from .holding import (
     BRAKE,
     FREE,
@@ -36,6 +35,13 @@ from .holding import (
 )
 from .prescribed import PrescribedMotion
 from .solution import HAPPENINGS, Events
+from .vector_field import (
+    Args,
+    efforts,
+    schedule_of,
+    vector_field,
+    with_prescribed_rates,
+)
 
 _STICKS, _SLIPS, _BOUNCES, _RESTS, _LEAVES, _BRAKED, _LET_GO, _STOPPED, _RESET = range(
     len(HAPPENINGS)

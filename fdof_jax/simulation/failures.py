@@ -16,8 +16,12 @@ from ..forces.reset import Reset
 from ..linkage.linkage import Linkage, joint_names, moving_joints
 from ..mechanics.kinematics import tip_jacobian
 from ..steps.derivative_control import linearised
-from .conditions import Until
-from .field import (
+from .formulation import start_of, term_of
+from .integrate import Inputs, Settings, last_switched
+from .solution import OUTCOMES, Solution
+from .solve import solve
+from .until import Until
+from .vector_field import (
     args_of,
     effort_and_switches,
     element_effort,
@@ -25,10 +29,6 @@ from .field import (
     initial_states,
     with_states,
 )
-from .formulation import start_of, term_of
-from .integrate import Inputs, Settings, last_switched
-from .solution import OUTCOMES, Solution
-from .solve import solve
 
 # An explicit method of order 8 is stable for steps up to some 3 to 6 times the time
 # scale of a mode. Where accuracy decides, steps are shorter than twice that.

@@ -13,7 +13,10 @@ from ..mechanics.equations import Scalars, zeros
 from ..steps.landing import Clock, clearance
 from ..steps.term import Integrated, ScheduledTerm
 from .events import resolve
-from .field import (
+from .holding import changes, guarded_switching, unknown_modes
+from .prescribed import prescribed
+from .sampler import ClockElement, SampleState, after_samples, sampler_of
+from .vector_field import (
     Args,
     health_of,
     schedule_of,
@@ -23,9 +26,6 @@ from .field import (
     whole,
     with_prescribed_rates,
 )
-from .holding import changes, guarded_switching, unknown_modes
-from .prescribed import prescribed
-from .sampling import ClockElement, SampleState, after_samples, sampler_of
 
 # By which a clock is ahead of the one before, in units of `clearance`: beyond the
 # distances that steps keep from each time.

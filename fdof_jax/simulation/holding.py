@@ -31,9 +31,9 @@ from ..mechanics.equations import Constants, Equations, Upper, equations, with_h
 from ..mechanics.rates import efforts_of_fixed
 from ..mechanics.solve import divided, solver_of, times, with_added
 from ..steps.term import Integrated
-from .field import Args, Schedules, applied, args_of
 from .prescribed import prescribed
 from .solution import MODES, Events
+from .vector_field import Args, Schedules, applied, args_of
 
 FREE, FRICTION, LOWER, UPPER, BRAKE = range(len(MODES))
 MOST_EVENTS = 64  # recorded; of more, the last ones

@@ -28,14 +28,14 @@ from ..steps.looped_dopri8 import LoopedDopri8
 from ..steps.term import Integrated
 from ..steps.tolerances import default_controller, error_control_of, with_tolerances
 from .arrays import in_arrays
-from .conditions import CONDITIONS, End, conditions_in
 from .events import in_order
-from .field import args_of, initial_own, own_states
 from .formulation import clocks_apart, joints_at, known_times, start_of, term_of
 from .holding import changes, leaves_prescribed, taken_at, within_stops
 from .prescribed import agrees
-from .sampling import sampler_of
+from .sampler import sampler_of
 from .solution import Solution
+from .until import CONDITIONS, End, conditions_in
+from .vector_field import args_of, initial_own, own_states
 
 RESULTS: Any = diffrax.RESULTS
 # What `solve_options` returns; sweeps add `lanes` (see `loop.Scheme`).

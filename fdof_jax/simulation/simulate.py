@@ -27,15 +27,15 @@ from ..linkage.coordinates import State, real_state
 from ..linkage.fields import check_values, jumps_at
 from ..linkage.linkage import Linkage, check_linkage
 from ..steps.tolerances import at_tolerances, check_method, with_longest, within_reach
-from .conditions import conditions
 from .failures import cause, check_arguments
-from .field import initial_states
 from .holding import leaves_prescribed, within_stops
 from .integrate import Inputs, Settings, faults
 from .prescribed import agrees, prescribed
 from .scene import Scene, accepts_scene
 from .solution import OUTCOMES, Solution, outcome_numbers
 from .solve import solve
+from .until import conditions
+from .vector_field import initial_states
 
 
 def solve_options(

@@ -18,7 +18,7 @@ from ..forces.element import OwnStates
 from ..linkage.linkage import Linkage
 from ..linkage.topology import rate_unit
 from ..steps.tolerances import SINGLE_TOLERANCE, TOLERANCE
-from .conditions import End
+from .until import End
 
 Statistics = dict[str, Any]  # arrays by name, and diffrax's `max_steps`
 

@@ -1,8 +1,8 @@
 """The loop of an integration: steps of diffrax's methods, taken by hand.
 
 Unlike those of `diffeqsolve`, steps end where something happens, and are judged by more
-than their error. A step only finds what happens at its end. The next one does it, anew
-each time it is tried.
+than their error. A step only finds what happens at its end; the next one does it, anew
+each time it is tried: a step finds a bounce, and the next one begins with the impact.
 """
 
 from typing import Any, NamedTuple
@@ -30,7 +30,10 @@ _SLACK, _MOST = 1.5, 7 / 8
 
 
 class Problem(NamedTuple):
-    """An initial value problem over the output times `ts`."""
+    """An initial value problem over the output times `ts`.
+
+    Of `args`, the branches, modes and samples in force are those of the loop's state.
+    """
 
     term: ScheduledTerm
     start: Integrated
@@ -42,8 +45,9 @@ class Scheme(NamedTuple):
     """The numerical scheme: method, control and ends of steps.
 
     - `dt0`: length of the first step, None for the controller's estimate.
-    - `judge`, `events`: None if the controller judges no errors; `events` also if
-      nothing switches. `landing`: None without events and known times.
+    - `judge`, `events`: None if the controller judges no errors, as with constant
+      steps, where branches are those of each instant; `events` also if nothing
+      switches. `landing`: None without events and known times.
     - `lanes`: the axis of a batch in which a lane gives up when most are long done.
     """
 
@@ -66,8 +70,11 @@ class Attempt(NamedTuple):
     - `y`: the state at `t`, before what happens there.
     - `jumped`: whether rates may jump there, because the step before ended at a known
       time or a switch, or the controller says so; None if they never do.
+    - `method`, `landing`: states of the method and of `Landing`.
     - `judged`: state of `Judge`, or else of the controller; `wrappers`: of controllers
-      around the one that judges errors.
+      around the one that judges errors, such as diffrax's `ClipStepSizeController`.
+    - `switches`: which branches and modes hold, and what happens at `t`; `sampled`: the
+      state of a controller that samples. Each is None without any.
     - `rows`: states at output times, infinite at those to come; `saved`: how many are
       there.
     - `steps`, `accepted`: numbers of steps tried and kept; `typical`: how many most
@@ -98,7 +105,7 @@ class _StepResult(NamedTuple):
     """A step that was taken, whether it is kept or not.
 
     - `y1`: the state at its end; `path`: there and between.
-    - `error`: by the method, an `Estimate` if that has checked the end too.
+    - `error`: by the method, a `dopri8.Estimate` if it has checked the end too.
     - `failed`: result of the method; `found`: what happens in the step.
     """
 
@@ -148,7 +155,7 @@ def solve(problem: Problem, scheme: Scheme) -> Attempt:
         if scheme.lanes is not None:
             result, typical = _together(steps, typical, result, scheme.lanes)
         kept = lambda after, before: chosen(step.keep, after, before)
-        return Attempt(
+        return Attempt(  # what is not `kept` already knows whether the step was
             t=t,
             end=jnp.where(at_end, last, jnp.minimum(step.t1, last)),
             y=kept(_after_gap(problem.term, scheme, a, taken, step), a.y),
@@ -172,7 +179,7 @@ def solve(problem: Problem, scheme: Scheme) -> Attempt:
         goes_on = (a.t < last) & (a.result == RESULTS.successful)
         if a.switches is None or a.switches.ended is None:
             return goes_on
-        return goes_on & (a.switches.ended < 0)
+        return goes_on & (a.switches.ended < 0)  # no condition has ended it
 
     final = eqx.internal.while_loop(
         lambda a: unfinished(a) & (True if most is None else a.steps < most),
@@ -259,10 +266,9 @@ def _taken(problem: Problem, scheme: Scheme, a: Attempt) -> _StepResult:
     if events is not None:
         y0, regime = events.crossed(a.t, a.y, args, a.switches, jumped)
         args = args._replace(sides=regime.sides, modes=regime.modes)
-    if term.settle is not None:
+    if term.settle is not None:  # by an impact, to velocities that are prescribed
         y0, jumped = term.settle(a.t, y0, args), True  # rates of before are out of date
-    # After all impacts, of which a controller measures what is left; its commands move
-    # no joint at once.
+    # A controller measures the state after impacts. Its commands change accelerations.
     if term.sample is not None:
         sampled, changed = term.sample(a.t, y0, args)
         args, jumped = args._replace(sampled=sampled), jumped | changed
@@ -336,8 +342,8 @@ def _after_gap(
 ) -> Integrated:
     """Returns the state where the next step begins, before what happens there.
 
-    Steps leave a gap at known times (see `clearance`). The motion goes on meanwhile, as
-    the gaps of many such times would add up.
+    Steps leave a gap at known times, which rounding must not pass (`clearance` in
+    landing.py). The motion goes on meanwhile, as many such gaps would add up.
     """
     landing = scheme.landing
     if landing is None or not landing.timed:
@@ -352,7 +358,10 @@ def _after_gap(
 
 
 def _around(answer: tuple, controller: Controller) -> Controller:
-    """Returns a controller in which the one that judges errors gives an answer."""
+    """Returns a controller in which the one that judges errors gives an answer.
+
+    It is in the order of diffrax's, as are the fields of `NextStep`.
+    """
     return with_error_control(lambda _: _FixedAnswer(answer), controller.wrap(1))
 
 
@@ -383,6 +392,7 @@ def _saved(
 
 
 def _row(y: Integrated, args: Arguments) -> PyTree:
+    """Returns what output times keep; of events and memories the last state serves."""
     modes, sampled = args.modes, args.sampled
     modes = None if modes is None else modes._replace(events=None)
     if sampled is not None:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import PyTree
 
-# Equations have types of their own (`simulation.field.Args`), which steps do not know.
+# Equations have their own types (`simulation.vector_field.Args`), unknown to steps.
 Integrated = PyTree  # a state: positions, rates, the elements' own
 Arguments = PyTree  # of the equations: a named tuple with a linkage, q0 and sides
 Term = Any  # a `ScheduledTerm`

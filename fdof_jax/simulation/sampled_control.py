@@ -16,10 +16,10 @@ from ..forces.joints import JointEffort
 from ..linkage.coordinates import State, real_state
 from ..linkage.linkage import Linkage, check_linkage, joints_of
 from ..steps.landing import Clock, clearance
-from .field import has_states
-from .sampling import Arrivals, Sampler
+from .sampler import Arrivals, Sampler
 from .simulate import check_elements, simulate
 from .solution import Solution
+from .vector_field import has_states
 
 
 def step(

@@ -10,9 +10,9 @@ from jax import Array
 from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
-from .checks import is_traced, real_array
-from .control import PDController
-from .forces import (
+from ..checks import is_traced, real_array
+from ..control import PDController
+from ..forces import (
     Condition,
     StatefulElement,
     Values,
@@ -22,7 +22,7 @@ from .forces import (
     field,
     naming,
 )
-from .linkage import Linkage, joints_of
+from ..linkage import Linkage, joints_of
 
 
 class PIDController(StatefulElement):

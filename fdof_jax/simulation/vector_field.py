@@ -38,9 +38,9 @@ from ..mechanics.equations import (
 from ..mechanics.rates import conditioning, rates, rates_and_conditioning
 from ..mechanics.solve import divided, minus, solver_of, times, with_added
 from ..steps.term import Health, Integrated, health_if
-from .conditions import CONDITIONS, Until
 from .prescribed import prescribed
-from .sampling import Sampler, unsampled
+from .sampler import Sampler, unsampled
+from .until import CONDITIONS, Until
 
 Schedules = tuple[PyTree, ...]  # of all elements, which depend on time alone
 
