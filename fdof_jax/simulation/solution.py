@@ -153,7 +153,7 @@ class Solution(eqx.Module):
     or a `Reset`, else None:
 
     - `modes`: what holds each joint at `ts`: 0 nothing, 1 friction, 2 its lower stop, 3
-      its upper stop, 4 a brake. At an event it is the mode before or after it.
+      its upper stop, 4 a brake. At an event, `modes` and `qd` are as before or after.
     - `taken`: energy taken up to `ts` by friction, impacts, brakes, resets and the
       catching of payloads [J]. Friction whose level is a function is not counted.
     - `events`: the `Events`, whose times have derivatives.
