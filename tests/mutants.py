@@ -354,6 +354,53 @@ MUTANTS = {
         "tests/test_limits.py"
         "::test_the_errors_of_a_joint_that_nothing_drives_count_nothing[RR-kd1]",
     ),
+    "a search leaves what bounds hold": Mutant(
+        "tuning/search.py",
+        "((z >= high) & (gradient < 0))",
+        "((z >= high) & (gradient > 0))",
+        "tests/test_bounded_search.py"
+        "::test_runs_that_fail_that_bounds_hold_and_that_are_flat_end_beside_another",
+    ),
+    # Instants: elements, references, analyses
+    "stops hold back what leaves them": Mutant(
+        "forces/joints.py",
+        "damped = 1 + damping * rate",
+        "damped = 1 - damping * rate",
+        "tests/test_joint_elements.py::test_efforts_of_a_state",
+    ),
+    "a damper alone slackens a cable": Mutant(
+        "forces/points.py",
+        "on = switch(self.side * tension, True, both, continuous=True)",
+        "on = True",
+        "tests/test_points.py::test_one_sided_springs",
+    ),
+    "the weight is held about the ground's pivot": Mutant(
+        "control/pd.py",
+        "turning = moment - mass * start[k + 1].real",
+        "turning = moment",
+        "tests/test_control.py::test_models_hold_the_weight_or_have_the_inverse_dynamics",
+    ),
+    "links run along their own x axis": Mutant(
+        "mechanics/inverse_kinematics.py",
+        "bend = jnp.where(r2, own2 + plane_angle(root, inner) - own3,",
+        "bend = jnp.where(r2, own2 + plane_angle(root, inner),",
+        "tests/test_kinematics.py"
+        "::test_both_branches_reach_the_pose_and_one_is_the_original[RRR]",
+    ),
+    "a circle is left where its start unwinds": Mutant(
+        "references/task.py",
+        "return wrist, bearing - 2 * np.pi * whole_turns(first)",
+        "return wrist, bearing",
+        "tests/test_references.py"
+        "::test_the_reference_never_jumps_and_counts_its_turns[around the base-RRR]",
+    ),
+    "bearings turn about the ground's pivot": Mutant(
+        "analysis/reactions.py",
+        "about = about_pivot - cross(joint, carried)",
+        "about = about_pivot",
+        "tests/test_reactions.py"
+        "::test_each_link_is_in_balance_and_free_components_are_efforts",
+    ),
     # Conditions
     "what switches at once has no time": Mutant(
         "steps/events.py",

@@ -16,7 +16,6 @@ import pytest
 from elements import SHORT
 
 import fdof_jax as fj
-from fdof_jax.tuning.losses import relative_demands
 
 pytestmark = pytest.mark.slow
 ARM, VALUES = elements.arm("RPR"), {n: np.asarray(v) for n, v in elements.ARM.items()}
@@ -70,7 +69,6 @@ def without_fixed(tree):
 
 Q, QD, QDD, TAU = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (4, 3)))
 PD = fj.PDController([90.0, 70.0, 50.0], 2.0, np.inf, elements.Hold(Q))
-WEAK = PD.replace(limit=1e-6)
 # At points, with masses and with states; all act in `test_elements_act_alike`.
 SOME = tuple(elements.ALL[name] for name in ("spring", "actuator", "motor with PID"))
 MASSES = tuple(elements.WITH_INERTIA.values())
@@ -89,28 +87,11 @@ def moves(arm, q, qd, forces):
     return motion.q, motion.qd, efforts.total, efforts.elements, reactions.mT
 
 
-def linear(arm, q, qd, forces, *direction):
-    A, B = fj.linearize(arm, fj.State(q, qd), forces)
-    return (A @ jnp.ravel(jnp.stack(direction))).reshape(2, -1), (B @ q).reshape(2, -1)
-
-
 def follows(arm, q, qd, move):
     joints = (1, 3) if arm is ARM else (1, PLACE + 1, 4)  # a fixed one is ignored
     forces = fj.simulation.PrescribedMotion(joints, move), fj.JointDamper(0.5)
     motion = fj.simulate(arm, fj.State(q, 0 * qd), [0, 0.05, 0.1], forces)
     return motion.q, motion.qd, fj.joint_efforts(arm, forces, motion).elements
-
-
-def sampled(arm, q, qd, pd):
-    start = fj.State(q, qd)
-    motion = fj.simulate_sampled(arm, start, pd, 0.02, 2, **SHORT)
-    once = fj.step(arm, start, motion.tau[0], 0.02, **SHORT)
-    return motion.q, motion.qd, motion.tau, once.q, once.qd
-
-
-def demands(arm, q, qd, pd):
-    motion = fj.Solution(jnp.zeros(1), q[None], qd[None], {}, None)
-    return relative_demands(pd, arm, motion)
 
 
 def balanced(arm, q, qd, pd):
@@ -139,9 +120,6 @@ def compare(found, expected, name=""):
 COMPARED = {
     "dynamics": (dynamics, (QDD, TAU, MASSES)),
     "motion": (moves, (SOME,)),
-    "linear": (linear, (SOME[:1], QDD, TAU)),
-    "sampled": (sampled, (WEAK.replace(limit=5.0),)),
-    "demands": (demands, (WEAK,)),
     "equilibrium": (balanced, (PD,)),
     "prescribed": (follows, (MOVE,)),
 }
