@@ -42,6 +42,7 @@ EVER_FASTER = f"{RESETS}::test_jumps_that_follow_each_other_ever_faster_are_name
 BOUNCES = f"{HOLDING}::test_a_mass_bounces_to_rest_at_a_known_time"
 BATCHED = "tests/test_batched_rules.py"
 ENDS_MOVED = f"{BATCHED}::test_ends_that_only_the_condition_moves"
+READING = "tests/mjcf/test_mjcf_reading.py"
 FIRST_ENDS = f"{CONDITIONS}::test_the_first_of_several_ends_it"
 
 MUTANTS = {
@@ -496,6 +497,61 @@ MUTANTS = {
         "power = jnp.where(found.resets, _RESET_PACE, _PACE)",
         "power = _PACE",
         f"{RESETS}::test_where_a_reset_leaves_its_condition",
+    ),
+    # Models of MuJoCo
+    "gains of a model without their gears": Mutant(
+        "mjcf/actuators.py",
+        "kp, kd = 0 - bias[:, 1:].T @ gear**2",
+        "kp, kd = 0 - bias[:, 1:].T @ abs(gear)",
+        f"{READING}::test_numbers_of_the_account_and_of_the_elements",
+    ),
+    "welded bodies turn about their own centres": Mutant(
+        "mjcf/chain.py",
+        "inertias[k] += mass @ np.abs(places - center) ** 2",
+        "pass",
+        f"{READING}::test_models_accelerate_as_in_mujoco"
+        "[several joints in a body, in a turned plane]",
+    ),
+    "quaternions of whole angles": Mutant(
+        "mjcf/writing.py",
+        "_text(np.cos(angle / 2), 0, 0, np.sin(angle / 2))",
+        "_text(np.cos(angle / 2), 0, 0, np.sin(angle))",
+        "tests/mjcf/test_mjcf.py::test_arms_with_fixed_pairs_come_back_as_they_were",
+    ),
+    # Loops and measures
+    "a reference has no acceleration": Mutant(
+        "servo/loops.py",
+        "position = position + A @ (rate + A @ acceleration)",
+        "position = position + A @ rate",
+        "tests/servo/test_loops.py"
+        "::test_the_bandwidth_is_that_of_the_response_to_the_reference[light model]",
+    ),
+    "a response counts from the next sample": Mutant(
+        "servo/measures.py",
+        "ts = np.append(begin, ts[ts > begin])",
+        "ts = ts[ts >= begin]",
+        "tests/servo/test_measures.py"
+        "::test_a_step_of_a_slide_is_that_of_a_second_order_system[0.0037]",
+    ),
+    # References, pictures and pages
+    "a shock is beside the profile": Mutant(
+        "references/timing.py",
+        "return (1 - self.shock) * PROFILES",
+        "return PROFILES",
+        "tests/test_travel.py::test_the_shock_takes_the_load_s_frequency_out[2.0]",
+    ),
+    "the mean of sampled efforts acts": Mutant(
+        "pictures/energy_balance.py",
+        "between[:controls] = efforts[:controls, :-1]",
+        "pass",
+        "tests/pictures/test_plotting.py"
+        "::test_energy_stack_counts_what_friction_takes_once",
+    ),
+    "lines of a page lack their small parts": Mutant(
+        "viewer/lines.py",
+        "for k, size in enumerate(sizes) if size > small",
+        "for k, size in enumerate(sizes) if size > 1e4 * small",
+        "tests/viewer/test_view.py::test_lines_are_those_of_the_drawing",
     ),
 }
 

@@ -1,49 +1,26 @@
-"""MuJoCo's own accelerations and motions, compared with those of arms read from it."""
+"""MuJoCo's own accelerations, compared with those of arms read from its models."""
 
 import copy
-from typing import Any, NamedTuple
 
-import jax
+import equinox as eqx
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
 import fdof_jax as fj
 
 # MuJoCo has other models of these, which the comparisons leave out on both sides.
-APPROXIMATE = (fj.forces.JointStops, fj.forces.JointFriction)
+APPROXIMATE = fj.forces.JointStops, fj.forces.JointFriction
 SLIDE, HINGE = 2, 3  # MuJoCo's mjtJoint
 
 
-class Arm(NamedTuple):
-    """Where the arm's joints are in MuJoCo's arrays, in order."""
-
-    joints: np.ndarray
-    qpos: np.ndarray
-    dofs: np.ndarray
-    sign: np.ndarray  # q = sign * qpos, qd = sign * qvel, tau = sign * qfrc
-
-
-def arm_of(model):
-    """Finds the arm: of the trees of hinges and slides, that of the most joints.
-
-    Hinges count more, so that an arm of one hinge goes before a target on two slides.
-    """
-    trees = {}
-    for joint in range(model.njnt):
-        tree = int(model.dof_treeid[model.jnt_dofadr[joint]])
-        trees.setdefault(tree, []).append(joint)
-    kinds = lambda joints: [int(model.jnt_type[k]) for k in joints]
-    planar = [joints for joints in trees.values() if {*kinds(joints)} <= {SLIDE, HINGE}]
-    count = lambda joints: (kinds(joints).count(HINGE), len(joints))
-    joints = np.array(max(planar, key=count))
-    data = at_start(model)
-    mujoco.mj_forward(model, data)
-    hinges = model.jnt_type[joints] == HINGE
-    sign = np.ones(len(joints))
-    if hinges.any():
-        axes = data.xaxis[joints]
-        sign[hinges] = np.sign(axes[hinges] @ axes[hinges][0])
-    return Arm(joints, model.jnt_qposadr[joints], model.jnt_dofadr[joints], sign)
+def in_mujoco(source):
+    """Returns MuJoCo's model of a text or a file, and its data."""
+    kind = mujoco.MjModel
+    read = kind.from_xml_string if "<" in str(source) else kind.from_xml_path
+    model = read(str(source))
+    model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
+    return model, at_start(model)
 
 
 def at_start(model):
@@ -54,129 +31,92 @@ def at_start(model):
     return data
 
 
-def dropped(model, drop=()):
+def joints_of_arm(model):
+    """Returns the arm's joints, and their signs: q = sign * qpos.
+
+    Of the trees of hinges and slides it is that of most hinges, then of most joints.
+    """
+    trees, hinges = model.dof_treeid[model.jnt_dofadr], model.jnt_type == HINGE
+    planar = lambda tree: (model.jnt_type[trees == tree] >= SLIDE).all()
+    count = lambda tree: (hinges[trees == tree].sum(), (trees == tree).sum())
+    arm = max(filter(planar, np.unique(trees)), key=count)
+    joints, data = np.flatnonzero(trees == arm), at_start(model)
+    mujoco.mj_forward(model, data)
+    axes, hinges = data.xaxis[joints], hinges[joints]
+    return joints, np.where(hinges, np.sign(axes @ axes[np.argmax(hinges)]), 1)
+
+
+def comparable(model, drop):
     """Returns a copy without what `drop` names, and without what is approximate."""
-    model = copy.copy(model)
-    bits = mujoco.mjtDisableBit
-    flags = bits.mjDSBL_FRICTIONLOSS | bits.mjDSBL_LIMIT | bits.mjDSBL_CONTACT
-    if "actuators" in drop:
-        flags |= bits.mjDSBL_ACTUATION
-    if "equalities" in drop:
-        flags |= bits.mjDSBL_EQUALITY
-    model.opt.disableflags |= int(flags)
+    model, bits = copy.copy(model), mujoco.mjtDisableBit
+    off = bits.mjDSBL_FRICTIONLOSS | bits.mjDSBL_LIMIT | bits.mjDSBL_CONTACT
+    off |= bits.mjDSBL_ACTUATION if "actuators" in drop else 0
+    off |= bits.mjDSBL_EQUALITY if "equalities" in drop else 0
+    off |= bits.mjDSBL_SPRING if "springs" in drop else 0
+    model.opt.disableflags |= int(off)
     model.dof_frictionloss[:] = model.tendon_frictionloss[:] = 0
     model.opt.density = model.opt.viscosity = 0
-    if "springs" in drop:
-        model.jnt_stiffness[:] = 0
     if "tendons" in drop:
         model.tendon_stiffness[:] = model.tendon_damping[:] = 0
+    model.opt.timestep = 1e-14  # currents and slew rates act at the end of a step
     return model
 
 
-def random_controls(model, rng):
-    """Returns controls within their ranges, (nu,)."""
-    low, high = model.actuator_ctrlrange.T
-    limited = rng.uniform(np.minimum(low, high), np.maximum(low, high))
-    return np.where(model.actuator_ctrllimited, limited, rng.normal(size=model.nu))
+@eqx.filter_jit
+@eqx.filter_vmap(in_axes=(None, None, 0, 0, 0))
+def rates(linkage, forces, q, qd, own):
+    """Returns accelerations, and rates of the actuators' states, at time 0.
 
-
-def random_places(model, arm, rng):
-    """Returns positions of the arm's joints within their ranges, in MuJoCo's sense."""
-    spread = np.where(model.jnt_type[arm.joints] == HINGE, 1.2, 0.4)
-    places = model.qpos0[arm.qpos] + rng.normal(size=len(arm.joints)) * spread
-    low, high = model.jnt_range[arm.joints].T
-    inside = np.clip(places, low + 0.01 * (high - low), high - 0.01 * (high - low))
-    return np.where(model.jnt_limited[arm.joints], inside, places)
-
-
-def exact(forces):
-    """Returns the elements that are not approximate."""
-    return tuple(force for force in forces if not isinstance(force, APPROXIMATE))
-
-
-def accelerations(linkage, forces, q, qd):
-    """Computes accelerations at time 0 in many states, (states, n)."""
+    The states are those at the start, if `own` is None.
+    """
+    tau, growth = jnp.zeros_like(q), ()
+    for force in forces:
+        state = force.initial_state(linkage)
+        if has_state := np.size(state) > 0:
+            state = state if own is None else own
+        effort, rate = force.act(0.0, q, qd, linkage, state)
+        tau, growth = tau + effort, rate if has_state else growth
     inertial = tuple(f for f in forces if isinstance(f, fj.forces.InertialElement))
-
-    def at_once(q, qd):
-        tau = np.zeros(q.shape)
-        for force in forces:
-            state = force.initial_state(linkage)
-            tau = tau + force.act(0.0, q, qd, linkage, state)[0]
-        return fj.forward_dynamics(linkage, q, qd, tau, inertial)
-
-    return np.asarray(jax.vmap(at_once)(q, qd))
+    return fj.forward_dynamics(linkage, q, qd, tau, inertial), growth
 
 
-def compare(model, read: Any, rng, states=20, drop=()):
-    """Returns the greatest error of accelerations, |qdd - qacc| / (1 + max|qacc|).
+def error_of(source, drop):
+    """Returns the greatest error of accelerations and rates, relative to the largest.
 
-    Half of the states have the controls of the key frame or 0, half have random ones.
-    Stateful actuators stay in their state at the start.
-
-    **Arguments:** `model`: MuJoCo's; `read`: a function that returns the `MjcfModel`
-    for controls, (nu,), or for None; `drop`: what was left out on purpose.
+    It is that of a few random states under random controls.
     """
-    model, errors = dropped(model, drop), []
-    model.opt.timestep = 1e-14  # currents and slew rates act at the end of a step
-    arm, start = arm_of(model), at_start(model)
-    for controls in (None, random_controls(model, rng)):
-        mine = read(controls)
-        np.testing.assert_allclose(
-            [mine.state0.q, mine.state0.qd],
-            [arm.sign * start.qpos[arm.qpos], arm.sign * start.qvel[arm.dofs]],
-            atol=1e-12,
-        )
-        places, rates, expected = [], [], []
-        for _ in range(states // 2):
-            data = at_start(model)
-            data.qpos[arm.qpos] = random_places(model, arm, rng)
-            data.qvel[arm.dofs] = rng.normal(size=len(arm.dofs))
-            if controls is not None:
-                data.ctrl[:] = controls
-            mujoco.mj_forward(model, data)
-            places.append(arm.sign * data.qpos[arm.qpos])
-            rates.append(arm.sign * data.qvel[arm.dofs])
-            expected.append(arm.sign * data.qacc[arm.dofs])
-        qdd = accelerations(
-            mine.linkage, exact(mine.forces), *map(np.array, (places, rates))
-        )
-        expected = np.array(expected)
-        size = 1 + np.abs(expected).max(axis=1, keepdims=True)
-        errors.append(np.abs((qdd - expected) / size).max())
-    return float(max(errors))
-
-
-def motion_of(model, ts, step):
-    """Returns the arm's positions, in its sense, at times after the first."""
-    model, arm = copy.copy(model), arm_of(model)
-    model.opt.integrator, model.opt.timestep = mujoco.mjtIntegrator.mjINT_RK4, step
-    data, places = at_start(model), []
-    for _ in ts[1:]:
-        mujoco.mj_step(model, data, round((ts[1] - ts[0]) / step))
-        places.append(arm.sign * data.qpos[arm.qpos])
-    return np.array(places)
-
-
-def compare_motion(model, read, seconds=1.0, drop=()):
-    """Returns the greatest error of positions, |q - qpos| / (1 + max|qpos|).
-
-    MuJoCo moves by RK4 with steps of 0.1 ms, with the controls of the key frame or 0.
-    Its stateful actuators are of the first order in the step, so that positions are
-    extrapolated from these steps and their halves.
-    """
-    model, mine, ts = dropped(model, drop), read(None), np.linspace(0, seconds, 11)
-    coarse, fine = (motion_of(model, ts, step) for step in (1e-4, 5e-5))
-    expected = 2 * fine - coarse
-    scene = fj.Scene(mine.linkage, mine.state0, exact(mine.forces), seconds)
-    q = np.asarray(fj.simulate(scene, ts, rtol=1e-10, atol=1e-11).q)[1:]
-    return float(np.abs(q - expected).max() / (1 + np.abs(expected).max()))
-
-
-def in_mujoco(text):
-    model = mujoco.MjModel.from_xml_string(text)
-    model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
-    return model, mujoco.MjData(model)
+    rng, model = np.random.default_rng(0), comparable(in_mujoco(source)[0], drop)
+    (low, high), limited = model.actuator_ctrlrange.T, model.actuator_ctrllimited
+    controls = np.where(limited, rng.uniform(low, high), rng.normal(size=model.nu))
+    mine = fj.from_mjcf(source, controls=controls, drop=drop)
+    joints, signs = joints_of_arm(model)
+    places, speeds = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
+    start, acts = at_start(model), np.flatnonzero(model.actuator_actadr >= 0)
+    equal(mine.state0, signs * [start.qpos[places], start.qvel[speeds]], 1e-12)
+    if acts.size:
+        states = [np.asarray(f.initial_state(mine.linkage)) for f in mine.forces]
+        (state,) = (each for each in states if each.size)
+        equal(state[acts], start.act)
+    spread, rows = np.where(model.jnt_type[joints] == HINGE, 1.2, 0.4), []
+    for _ in range(3):
+        data = at_start(model)
+        moved = rng.normal(size=len(joints)) * spread
+        data.qpos[places] = model.qpos0[places] + moved
+        data.qvel[speeds] = rng.normal(size=len(joints))
+        data.act[:] = rng.uniform(-0.2, 0.2, size=model.na)  # within all limits
+        data.ctrl[:] = controls
+        mujoco.mj_forward(model, data)
+        own, growth = np.zeros((2, len(model.actuator_trntype)))
+        own[acts], growth[acts] = data.act, data.act_dot
+        arrays = data.qpos[places], data.qvel[speeds], data.qacc[speeds]
+        rows.append([*(signs * array for array in arrays), own, growth])
+    q, qd, qdd, own, growth = map(np.array, zip(*rows))
+    forces = tuple(f for f in mine.forces if not isinstance(f, APPROXIMATE))
+    pairs = zip(rates(mine.linkage, forces, q, qd, own), (qdd, growth))
+    error = lambda ours, theirs: (
+        np.abs(ours - theirs).max() / (1 + np.abs(theirs).max())
+    )
+    return max(error(*pair) for pair in pairs if np.size(pair[0]))
 
 
 def equal(values, expected, tolerance=1e-10):

@@ -1,10 +1,11 @@
-"""Pictures show the linkage in its place; pixels are not compared."""
+"""Pictures show arms, what acts on them and motions in their place, not pixels."""
 
 import equinox as eqx
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from elements import ELBOW, HOOK, TIP, WITH_INERTIA, arm
 from figures import (
     LINKAGE,
     Q,
@@ -18,12 +19,33 @@ from figures import (
     tidy as tidy,
 )
 from matplotlib.colors import to_rgb
+from PIL import Image
+from test_guides import DOCS, run
 
 import fdof_jax as fj
-from fdof_jax import TOPOLOGIES, drawing
+from fdof_jax import drawing
+
+ARM, AT = arm("RPR"), np.array([0.3, 0.2, 0.5])
 
 
-@pytest.mark.parametrize("topology", TOPOLOGIES)
+def close(points, expected):
+    np.testing.assert_allclose(points, expected, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_examples_of_the_guide_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = run(DOCS / "pictures.md")
+    for name in ("motion.html", "gains.html", "arm.png", "arm.gif", "arms.gif"):
+        assert (tmp_path / name).stat().st_size > 1000
+    np.testing.assert_array_equal(names["table"]["P2 [m]"], names["motion"].q[:, 1])
+    assert names["data"].sizes["time"] == 2001
+
+
+# Arms
+
+
+@pytest.mark.parametrize("topology", fj.TOPOLOGIES)
 def test_linkage_is_drawn_where_kinematics_puts_it(topology):
     linkage = make_linkage(topology)
     ax = drawing.draw_linkage(linkage, Q)
@@ -32,66 +54,33 @@ def test_linkage_is_drawn_where_kinematics_puts_it(topology):
     for k, kind in enumerate(topology, start=1):
         name, other = ("pin", "slider") if kind == "R" else ("slider", "pin")
         same(drawn[f"{name} {k}"], [starts[k - 1]])
-        assert f"{other} {k}" not in drawn
-        assert (f"rail {k}" in drawn) == (kind == "P")
+        assert f"{other} {k}" not in drawn and (f"rail {k}" in drawn) == (kind == "P")
         link = drawn[f"link {k}"].get_xydata()
-        np.testing.assert_allclose(link[0], starts[k - 1], atol=1e-12)
-        size = np.linalg.norm(link[1] - link[0])
-        np.testing.assert_allclose(size, linkage.length[k])
+        close(link[0], starts[k - 1])
+        close(np.linalg.norm(link[1] - link[0]), linkage.length[k])
         # The fixed offset belongs to the link, the slide to the rail.
         rail = drawn.get(f"rail {k + 1}", drawn[f"link {k}"]).get_xydata()
-        np.testing.assert_allclose(rail[-1], ends[k], atol=1e-12)
-        dot = drawn[f"mass {k}"].get_xydata()[-1]
+        close(rail[-1], ends[k])
+        if kind == "P":  # the carriage stands across
+            turn = drawn[f"slider {k}"]._marker.get_user_transform().get_matrix()
+            along = np.diff(drawn[f"rail {k}"].get_xydata(), axis=0)[0]
+            close(turn[0, 0] * along[1], turn[1, 0] * along[0])
         center = fj.mass_centers(linkage, Q)[k - 1]
-        np.testing.assert_allclose(dot, center, atol=1e-12)
+        close(drawn[f"mass {k}"].get_xydata()[-1], center)
     same(drawn["tip 3"], ends[-1:])
     # What lies on something else hides nothing: mass centres under the tip and pins.
     order = [line.get_gid().split()[0] for line in ax.lines if line.get_gid()]
     assert order.index("mass") < order.index("tip") < len(order) - 3
 
 
-def test_slides_stand_across_their_link_and_level_in_the_legend():
-    ax = drawing.draw_linkage(make_linkage("RPR"), Q)
-    drawn = lines(ax)
-    along = np.diff(drawn["link 1"].get_xydata(), axis=0)[0]
-    rail = np.diff(drawn["rail 2"].get_xydata(), axis=0)[0]
-    np.testing.assert_allclose(rail, 0.4 * np.array([-along[1], along[0]]), atol=1e-12)
-    turn = drawn["slider 2"]._marker.get_user_transform().get_matrix()
-    np.testing.assert_allclose(turn[:2, 0], rail / 0.4, atol=1e-12)
-    (slide,) = [line for line in ax.lines if line.get_label() == "slide"]
-    assert slide.get_xydata().size == 0
-    assert not slide._marker.get_user_transform()
-
-
 def test_linkage_options():
     ax = plt.subplots()[1]
     ax.scatter([5], [9])
     style = dict(color="red", alpha=0.5, mass_centers=False)
-    assert drawing.draw_linkage(make_linkage("RRP"), Q, ax, **style) is ax
+    drawn = lines(drawing.draw_linkage(make_linkage("RRP"), Q, ax, **style))
     assert ax.get_xlim()[1] > 5 and ax.get_ylim()[1] > 9  # what was there stays in view
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("x [m]", "y [m]")
-    assert ax.get_aspect() == 1
-    drawn = lines(ax)
-    assert not [name for name in drawn if name.startswith("mass")]
-    assert {drawn[f"link {n}"].get_color() for n in (1, 2, 3)} == {"red"}
-    assert drawn["link 1"].get_alpha() == 0.5
-
-
-def test_chrono_cyclograph_writes_times_beside_tips():
-    arm, start, *_ = fj.scenes.fig5()
-    ts = np.linspace(0, 1.5, 151)
-    motion = fj.simulate(arm, start, ts)
-    ax = drawing.chrono_cyclograph(arm, motion)
-    texts = [text for text in ax.texts if text.get_gid() == "time"]
-    shown = [text.get_text() for text in texts]
-    assert shown == ["1.5 s", "1.2 s", "0.9 s", "0.6 s", "0.3 s", "0 s"]
-    plt.gcf().draw_without_rendering()
-    drawn = [line.get_path().transformed(ax.transData) for line in ax.lines]
-    for text in texts:
-        box = text.get_window_extent()
-        assert not any(path.intersects_bbox(box, filled=False) for path in drawn)
-        k = np.abs(ts - float(text.get_text()[:-2])).argmin()
-        np.testing.assert_allclose(text.xy, fj.tip_position(arm, motion.q[k]))
+    assert ax.get_aspect() == 1 and ax.get_xlabel() == "x [m]" and "mass 1" not in drawn
+    assert (drawn["link 1"].get_color(), drawn["link 1"].get_alpha()) == ("red", 0.5)
 
 
 def test_chrono_cyclograph_takes_the_nearest_samples():
@@ -100,7 +89,7 @@ def test_chrono_cyclograph_takes_the_nearest_samples():
     last_links, samples = named(ax, "link 3"), [0, 10, 20, 30]
     for line, sample in zip(last_links, samples, strict=True):
         tip = fj.tip_position(linkage, solution.q[sample])
-        np.testing.assert_allclose(line.get_xydata()[-1], tip, atol=1e-12)
+        close(line.get_xydata()[-1], tip)
     brightness = [sum(to_rgb(line.get_color())) for line in last_links]
     assert brightness == sorted(brightness, reverse=True)
     assert len(named(ax, "tip 3")) == 1  # only the last configuration is whole
@@ -110,7 +99,6 @@ def test_chrono_cyclograph_takes_the_nearest_samples():
     # What a failed solve did not reach is left out.
     failed = eqx.tree_at(lambda s: s.q, solution, solution.q.at[51:].set(jnp.nan))
     for motion, until, count in (
-        (solution, None, 11),
         (solution, 5.0, 11),
         (solution, 0.0, 1),
         (failed, None, 6),
@@ -119,30 +107,200 @@ def test_chrono_cyclograph_takes_the_nearest_samples():
         assert len(named(ax, "link 3")) == count
 
 
-def test_topology_grid_has_a_panel_for_each():
-    motions = {name: (make_linkage(name), swinging(11)) for name in TOPOLOGIES}
-    fig = drawing.topology_grid(motions, configurations=2)
-    assert [ax.get_title() for ax in fig.axes] == list(TOPOLOGIES)
-    assert (fig.get_supxlabel(), fig.get_supylabel()) == ("x [m]", "y [m]")
-    assert {len(named(ax, "link 3")) for ax in fig.axes} == {2}
-
-
-@pytest.mark.parametrize("angle", [0.0, np.pi / 2])
-def test_a_straight_arm_has_room_around_it(angle):
-    arm = LINKAGE.replace(com=[[0.1, 0]] * 3, base_angle=angle, locked=0.0)
-    ax = drawing.draw_linkage(arm, [0, 0, 0])
-    width, height = np.ptp(ax.dataLim.get_points(), axis=0)
-    assert 0.39 < min(width, height) / max(width, height) < 0.41
-
-
-def test_labels_lie_inside_a_new_figure_as_it_is_saved():
-    ts = np.linspace(0, 1, 11)
+def test_times_and_labels_have_a_place_of_their_own():
+    linkage, ts = fj.scenes.fig5().linkage, np.linspace(0, 1, 11)
     motion = made_up(ts, -0.1 - 3.0 * ts[:, None] * [1, 0, 0])
-    axes = drawing.chrono_cyclograph(fj.scenes.fig5().linkage, motion)
-    axes.figure.draw_without_rendering()  # type: ignore[union-attr]
-    assert axes.xaxis.label.get_window_extent().y0 >= 0
+    ax = drawing.chrono_cyclograph(linkage, motion)
+    ax.figure.draw_without_rendering()
+    assert ax.xaxis.label.get_window_extent().y0 >= 0
+    texts = [text for text in ax.texts if text.get_gid() == "time"]
+    assert [text.get_text() for text in texts][::5] == ["1 s", "0 s"]
+    drawn = [line.get_path().transformed(ax.transData) for line in ax.lines]
+    for text in texts:
+        box = text.get_window_extent()
+        assert not any(path.intersects_bbox(box, filled=False) for path in drawn)
+        k = round(10 * float(text.get_text()[:-2]))
+        close(text.xy, fj.tip_position(linkage, motion.q[k]))
     # The limits that equal scales need have longer ticks than those before.
     drawing.animate(LINKAGE, made_up(ts, Q + ts[:, None] * [0.3, -0.8, 0.7]))
+    plt.gcf().draw_without_rendering()
+    assert plt.gcf().axes[0].yaxis.label.get_window_extent().x0 >= 0
+
+
+# Elements
+
+
+def drawn_with(*forces):
+    return lines(drawing.draw_linkage(ARM, AT, forces=forces))
+
+
+def strokes(line):
+    """Points of each stroke (point, 2); NaN lifts the pen."""
+    xy = line.get_xydata()
+    gaps = np.flatnonzero(np.isnan(xy[:, 0]))
+    return [part[np.isfinite(part[:, 0])] for part in np.split(xy, gaps)]
+
+
+def place(point):
+    return np.asarray(point.position(ARM, AT))
+
+
+def test_what_is_between_points_joins_them():
+    cable = dict(stiffness=3.0, one_sided="cable")
+    ends = np.stack([place(HOOK), place(TIP)])
+    for kind, values, hangs in (
+        ("spring", dict(stiffness=3.0), False),
+        ("damper", dict(damping=3.0), False),
+        ("cable", dict(rest_length=0.5, **cable), False),
+        ("cable", dict(rest_length=4.0, **cable), True),
+    ):
+        xy = drawn_with(fj.SpringDamper(HOOK, TIP, **values))[f"{kind} 0"].get_xydata()
+        close(xy[0], ends[0])
+        assert np.isclose(xy, ends[1]).all(axis=1).any()
+        assert (np.nanmin(xy[:, 1]) < ends[:, 1].min() - 0.1) == hangs
+    bumper = dict(stiffness=3.0, rest_length=0.5, one_sided="bumper")
+    _, plate, *_ = strokes(drawn_with(fj.SpringDamper(HOOK, TIP, **bumper))["bumper 0"])
+    close(np.linalg.norm(plate.mean(axis=0) - place(HOOK)), 0.5)  # its rest length
+
+
+def test_brackets_and_ground_hold_points_beside_links():
+    links = fj.scenes.fig5().linkage  # of 1 m along x
+    off, on, nail = fj.Point(1, 0.5, 0.3), fj.Point(2, 0.5), fj.Point(0, 0.5, -1.0)
+    ropes = tuple(fj.forces.Tension(point, on, 1.0) for point in (off, nail))
+    drawn = lines(drawing.draw_linkage(links, np.zeros(3), forces=ropes))
+    close(strokes(drawn["tension 0"]), [[[0.5, 0.3], [1.5, 0]], [[0.5, 0], [0.5, 0.3]]])
+    close(strokes(drawn["tension 1"])[1].mean(axis=0), [0.5, -1])
+
+
+def test_arrows_are_along_the_forces_and_as_long_as_they_are_large():
+    force = lambda t: jnp.array([3.0, 4.0 + t])
+    pushes = drawn_with(
+        fj.Wrench(TIP, force), fj.Wrench(ELBOW, [0.0, -1.0]), fj.Wrench(TIP, moment=2.0)
+    )
+    first, second, around = (pushes[f"wrench {k}"].get_xydata() for k in range(3))
+    close(first[0], place(TIP))
+    long, short = first[1] - first[0], second[1] - second[0]
+    close(long / np.linalg.norm(long), [0.6, 0.8])
+    assert 0.1 < np.linalg.norm(long) < 1.0  # the arm is 1.7 m long
+    close(short, [0, -np.linalg.norm(long) / 5])
+    around = around[:41] - place(TIP)
+    close(np.ptp(np.hypot(*around.T)), 0)
+    assert np.cross([*around[0], 0], [*around[1], 0])[2] > 0  # turns to the left
+
+
+def test_the_bars_of_stops_are_where_joints_touch_them():
+    parts = drawn_with(fj.forces.JointStops([0.1, -0.4, -np.inf], [1.2, 0.2, np.inf]))
+    low, high, _, across = strokes(parts["stops 0"])
+    for bar, turn in ((low, 0.1), (high, 1.2)):
+        x, y = bar.mean(axis=0) - parts["pin 1"].get_xydata()[0]
+        close(np.arctan2(y, x), float(ARM.base_angle) + turn)
+    touch = parts["slider 2"].get_xydata()[0]  # the upper end of the slide
+    close(across[-2:].mean(axis=0), touch)
+
+
+@pytest.mark.slow
+def test_the_path_of_a_controller_is_drawn_once_around():
+    pd = lambda reference: fj.PDController(1.0, 1.0, 1.0, reference)
+    there = fj.references.Travel(5.0)  # begins after the configuration drawn
+    line = fj.TipTask(fj.references.Line([-4, 2], [-3, 2]), there)
+    circle, plain = fj.CircleTask(), pd(lambda t, linkage: (AT, 0 * AT))
+    parts = drawn_with(pd(circle), fj.control.FirstOrderLag(pd(line), 0.1), plain)
+    first, second = (parts[f"commanded {k}"].get_xydata() for k in range(2))
+    assert "commanded 2" not in parts
+    turn = np.abs((first - np.asarray(circle.center)) @ [1, 1j])
+    np.testing.assert_allclose(turn, circle.radius, rtol=1e-12)
+    close(first[0], first[-1])
+    close(second[[0, -1]], [[-4, 2], [-3, 2]])
+
+
+def test_elements_move_with_the_arm_and_a_payload_comes():
+    """A cylinder keeps its length."""
+    later, now = (fj.forces.Payload(TIP, 0.4, begin=t) for t in (0.5, 0.0))
+    parts, solution = drawn_with(later, now), swinging()
+    assert "payload 0" not in parts
+    xy = parts["payload 1"].get_xydata()
+    close((xy.min(axis=0) + xy.max(axis=0)) / 2, place(TIP))
+    forces = later, WITH_INERTIA["actuator"]
+    animation = drawing.animate(ARM, solution, forces=forces, max_frames=3)
+    (ax,), lengths, there = plt.gcf().axes, [], []
+    for frame in range(3):
+        animation._func(frame)  # type: ignore[attr-defined]
+        xy = lines(ax)["cylinder 1"].get_xydata()
+        close(xy[-1], ELBOW.position(ARM, solution.q[50 * frame]))
+        lengths.append(np.linalg.norm(xy[2] - xy[1]))
+        there.append(np.isfinite(lines(ax)["payload 0"].get_xydata()).all())
+    assert np.ptp(lengths) < 1e-12 and there == [False, True, True]
+    animation._draw_was_started = True  # type: ignore[attr-defined]
+
+
+def test_what_has_no_place_is_not_drawn():
+    hidden = fj.JointDamper(1.0), lambda *_: 0, fj.forces.Brake(1)
+    assert drawn_with(*hidden).keys() == drawn_with().keys()
+    with pytest.raises(ValueError, match="link: expected 0"):
+        drawn_with(fj.Wrench(fj.Point(5), [1, 0]))
+
+
+# Motions
+
+
+def test_a_gif_holds_each_frame_until_the_end(tmp_path, capsys):
+    """It is drawn over what stands still; matplotlib draws all of each frame."""
+    solution, path = swinging(), tmp_path / "motion.gif"
+    animation = drawing.animate(ARM, solution, until=0.4, max_frames=3)
+    animation.save(path, dpi=50)
+    # One bar, as this is no terminal.
+    assert capsys.readouterr().err == f"\rmotion.gif [{30 * '#'}]\n"
+    animation.save(path.with_name("whole.gif"), dpi=50, writer="pillow")
+    with Image.open(path) as quick, Image.open(path.with_name("whole.gif")) as whole:
+        assert quick.n_frames == whole.n_frames == 3  # type: ignore[attr-defined]
+        apart = []
+        for frame in range(3):
+            quick.seek(frame)
+            whole.seek(frame)
+            pair = [np.asarray(image.convert("L"), float) for image in (quick, whole)]
+            apart.append(np.abs(pair[0] - pair[1]).mean())
+    assert max(apart) < min(4, 1.3 * apart[0])  # other colours, but no former frame
+    assert plt.gcf().axes[0].get_title() == "t = 0.40 s"
+
+
+def test_a_grid_moves_together_with_the_forces_of_its_titles():
+    spring = fj.SpringDamper(fj.Point(0, 1, 1), fj.Point(3, 0.6), stiffness=1)
+    short = make_linkage("PRR"), swinging(51, 0.5)
+    pairs, forces = (
+        {"long": (LINKAGE, swinging()), "short": short},
+        {"short": (spring,)},
+    )
+    for speed, frames in ((1.0, 26), (2.0, 14)):
+        animation = drawing.animate_grid(pairs, speed=speed)
+        assert len(list(animation.new_frame_seq())) == frames
+        animation._draw_was_started = True  # type: ignore[attr-defined]
+    animation = drawing.animate_grid(pairs, forces=forces, max_frames=5)
+    animation._draw_was_started = True  # type: ignore[attr-defined]
     figure = plt.gcf()
-    figure.draw_without_rendering()
-    assert figure.axes[0].yaxis.label.get_window_extent().x0 >= 0
+    # The short motion has ended at the last frame.
+    for frame, samples in ((1, (25, 25)), (4, (100, 50))):
+        animation._func(frame)  # type: ignore[attr-defined]
+        assert figure.get_suptitle() == f"t = {frame / 4:.2f} s"
+        for ax, (linkage, motion), i in zip(figure.axes, pairs.values(), samples):
+            tip = np.asarray(fj.tip_position(linkage, motion.q[i]))
+            same(lines(ax)["tip 3"], [tip])
+            assert len(lines(ax)["tip path"].get_xydata()) == i + 1
+        corners = np.asarray(lines(figure.axes[1])["spring 0"].get_xydata())
+        assert np.isclose(corners, tip).all(axis=1).any()
+    grid = drawing.topology_grid(pairs, forces=forces, configurations=2)
+    for panels in (figure, grid):
+        assert [ax.get_title() for ax in panels.axes] == ["long", "short"]
+        assert ["spring 0" in lines(ax) for ax in panels.axes] == [False, True]
+    assert {len(named(ax, "link 3")) for ax in grid.axes} == {2}
+
+
+def test_a_notebook_plays_an_animation_once_with_the_limits_of_its_panels(caplog):
+    """Checks that the notebook does not also show the animation's still figure."""
+    pairs = {t: (make_linkage(t), swinging()) for t in ("RRR", "PRR", "PPR")}
+    animation = drawing.animate_grid(pairs, fps=2)
+    axes = plt.gcf().axes
+    before = [ax.axis() for ax in axes]
+    html = animation._repr_html_()  # type: ignore[attr-defined]
+    assert html.count("data:image/png") == 3 and "<script" in html
+    assert not plt.get_fignums() and [ax.axis() for ax in axes] == before
+    assert caplog.text == ""  # matplotlib complains of limits that it cannot keep
