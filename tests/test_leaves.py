@@ -1,16 +1,23 @@
 """Leaves import the library as a user does, and no more than their names are shown."""
 
 import ast
+import functools
 from pathlib import Path
 
 import pytest
 from test_package import FOLDER, LEAVES, NAMESPACES
 
-PUBLIC = {Path(room.__file__): room for room in NAMESPACES}
+PUBLIC = {Path(room.__file__): {*room.__all__} for room in NAMESPACES}
 
 
+def leaf_of(place):
+    return LEAVES.get((*place.relative_to(FOLDER).parts, "")[0])
+
+
+@functools.cache
 def imports(path):
-    """Yields the file, or the folder, of each import of the library, and its names."""
+    """Returns the file of each import of the library, and its names."""
+    found = []
     for line in ast.walk(ast.parse(path.read_text())):
         if isinstance(line, ast.Import):
             assert not any(n.name.startswith("fdof_jax") for n in line.names), path
@@ -19,36 +26,23 @@ def imports(path):
             assert not module.startswith("fdof_jax"), path
             if line.level:
                 place = path.parents[line.level - 1].joinpath(*module.split("."))
-                yield place, [name.name for name in line.names]
-
-
-def leaf_of(place):
-    first = (*place.relative_to(FOLDER).parts, "")[0]
-    return LEAVES.get(first)
+                file = place / "__init__.py" if place.is_dir() else f"{place}.py"
+                found.append((Path(file), {name.name for name in line.names}))
+    return found
 
 
 @pytest.mark.parametrize("leaf", sorted({*LEAVES.values()}))
-def test_a_leaf_imports_public_names_alone(leaf):
-    files = [path for path in FOLDER.rglob("*.py") if leaf_of(path) == leaf]
-    assert files
-    for path in files:
-        for place, names in imports(path):
-            if leaf_of(place) == leaf:
-                continue
-            file = place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
-            assert file in PUBLIC, (path, file)
-            assert {*names} <= {*PUBLIC[file].__all__}, (path, names)
-
-
-@pytest.mark.parametrize("leaf", sorted({*LEAVES.values()}))
-def test_rooms_only_show_names_of_a_leaf(leaf):
-    shown = set()
+def test_a_leaf_imports_public_names_and_rooms_only_show_its_own(leaf):
+    taken, shown = set(), set()
     for path in FOLDER.rglob("*.py"):
-        if leaf_of(path) == leaf:
-            continue
-        for place, names in imports(path):
-            if leaf_of(place) == leaf:
-                assert path.name == "__init__.py", (path, place)
-                assert {*names} <= {*PUBLIC[path].__all__}, (path, names)
-                shown |= {*names}
-    assert shown
+        within = leaf_of(path) == leaf
+        for file, names in imports(path):
+            if within == (leaf_of(file) == leaf):
+                continue
+            if within:
+                assert names <= PUBLIC[file], (path, file)
+                taken |= names
+            else:
+                assert path.name == "__init__.py" and names <= PUBLIC[path], path
+                shown |= names
+    assert taken and shown
