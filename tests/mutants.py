@@ -44,6 +44,7 @@ BATCHED = "tests/test_batched_rules.py"
 ENDS_MOVED = f"{BATCHED}::test_ends_that_only_the_condition_moves"
 READING = "tests/mjcf/test_mjcf_reading.py"
 FIRST_ENDS = f"{CONDITIONS}::test_the_first_of_several_ends_it"
+REFUSALS, STORE = "tests/test_refusals.py", "tests/test_sweep_store.py"
 
 MUTANTS = {
     # Steps that end at switches and known times
@@ -552,6 +553,51 @@ MUTANTS = {
         "for k, size in enumerate(sizes) if size > small",
         "for k, size in enumerate(sizes) if size > 1e4 * small",
         "tests/viewer/test_view.py::test_lines_are_those_of_the_drawing",
+    ),
+    # Refusals, functions, files and sweeps
+    "fields past constructors are not checked": Mutant(
+        "linkage/fields.py",
+        'real_array(f"{place}.{name}", value, **rules)',
+        "pass",
+        f"{REFUSALS}::test_the_door_checks_what_a_constructor_has_not_seen",
+    ),
+    "a mass may be negative": Mutant(
+        "forces/payload.py",
+        'unit="kg", minimum=0',
+        'unit="kg"',
+        f"{REFUSALS}::test_what_resists_and_sizes_are_declared_to_be_at_least_zero",
+    ),
+    "JAX sorts the names of a closure": Mutant(
+        "base/functions.py",
+        "reach, is_leaf=_out_of_order)",
+        "reach)",
+        "tests/test_shared_functions.py::test_numbers_of_functions_are_right[order]",
+    ),
+    "a replaced file is readable by others": Mutant(
+        "base/whole_files.py",
+        "unfinished.chmod(stat.S_IMODE(path.stat().st_mode))",
+        "path.stat()",
+        "tests/test_files.py::test_a_replaced_file_keeps_permissions_and_links",
+    ),
+    "parts of results differ in case": Mutant(
+        "batches/store.py",
+        "if name.casefold() in taken:",
+        "if name in taken:",
+        f"{STORE}::test_names_of_parts_differ_in_letters",
+    ),
+    "members stay in the order of their chunks": Mutant(
+        "batches/chunks.py",
+        "results[index] = leaf[place]",
+        "results[index] = leaf",
+        "tests/test_sweep.py"
+        "::test_members_are_sorted_by_a_forecast_that_serves_all_sizes",
+    ),
+    "a warning names the library's line": Mutant(
+        "base/user_warnings.py",
+        "frame, level = frame.f_back, level + 1",
+        "frame = frame.f_back",
+        "tests/test_user_warnings.py"
+        "::test_a_warning_names_the_argument_and_the_callers_line",
     ),
 }
 

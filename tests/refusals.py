@@ -128,11 +128,6 @@ class Hostile:
         raise RuntimeError("no array")
 
 
-class Long:
-    def __repr__(self):
-        return "Long(" + 200_000 * "9" + "\x1b[31m\x00)"
-
-
 DELETED = jnp.ones(3) + 1
 DELETED.delete()
 A_CLASS, HUGE = fj.Linkage, 10**5000
@@ -140,11 +135,9 @@ TEXTS = ["one", 1_000_000 * "x" + "\x1b[31m\x07"]
 LISTS = [[[1.0], [1.0, 2.0]], ["9"] * 10_000]
 DICTS = [{}, {f"key {i}\n": i for i in range(10_000)}]
 HOSTILE = [DELETED, Hostile(), HUGE]
-# Wrong or right, by argument
-DOUBTFUL = [[], np.zeros(7), -1.5, 10**30]
 # Of any argument
 WRONG = [
-    None, object(), A_CLASS, float("nan"), 1j, b"abc", jax.random.key(0), Long(),
+    None, object(), A_CLASS, float("nan"), 1j, b"abc", jax.random.key(0),
     np.zeros((1, 2, 0)), np.array(["a"]), np.ma.masked_array([1.0], True),
     np.full(3, np.datetime64("2020-01-01")), np.zeros(3, [("a", float), ("b", int)]),
     ARM, MOTION, *TEXTS, *LISTS, *DICTS, *HOSTILE,
@@ -252,23 +245,16 @@ def refused_values(name, function, sound):
                 yield p.name, value, words
 
 
-# The fields that declare a bound of 0
-BOUNDS = {
-    "above": """DCMotor.constant DCMotor.current_limit DCMotor.gear DCMotor.resistance
+# Fields are bounded by 0 if their unit is of what resists, or their name of a size.
+RESISTING = """kg, kg m^2, kg m^2 or kg, N/m, N/m or N m/rad, N s/m, N s/m or N m s/rad
+s/m or s/rad, N/(m s) or N m/(rad s), ohm, H, N m/A or N/A, V, A""".replace("\n", ", ")
+SIZES = """limit level static coulomb stall effort effort_rate rest_length radius sizes
+time_constant duration settling_time no_load speed smoothing restitution overshoot
+modulus_margin""".split()
+POSITIVE = """DCMotor.constant DCMotor.current_limit DCMotor.gear DCMotor.resistance
 DCMotor.voltage_limit FirstOrderLag.time_constant JointFriction.speed
 JointStops.smoothing JointStops.stiffness Limits.effort SpeedLimit.no_load
-SpeedLimit.stall Travel.duration stribeck.speed""".split(),
-    "minimum": """Armature.inertia CircleTask.radius ComputedTorque.kd ComputedTorque.kp
-ComputedTorque.limit DCMotor.inductance Ellipse.sizes FigureEight.sizes
-GravityFeedforward.kd GravityFeedforward.kp GravityFeedforward.limit
-HardStops.restitution JointDamper.coefficient JointFriction.level
-JointFriction.static JointSpring.stiffness JointStops.damping
-Limits.modulus_margin Limits.overshoot Limits.settling_time
-LinearActuator.inertia LinearActuator.mass PDController.kd PDController.kp
-PDController.limit PIDController.ki Payload.inertia Payload.mass Rotor.inertia
-SpringDamper.damping SpringDamper.rest_length SpringDamper.stiffness
-Tracking.effort Tracking.effort_rate stribeck.coulomb stribeck.static""".split(),
-}
+SpeedLimit.stall Travel.duration stribeck.speed""".split()
 
 # What no declaration tells: rows of how messages begin, what is changed beside sound
 # arguments, and the kind of error unless it is a ValueError
@@ -288,15 +274,12 @@ def returns(value):
     return lambda t, q, qd, linkage: value
 
 
-def reset(when, then, words, error=ValueError):
-    return acting(f"@.{words}", forces.Reset(when, then), error=error)
-
-
-def following(words, reference, **changes):
+def following(motion):
     """Yields rows of a controller, of a lag of it, and of a lag of that."""
-    element = fj.PDController(1.0, 1.0, 1.0, reference)
+    words = "@.reference"
+    element = fj.PDController(1.0, 1.0, 1.0, lambda t, linkage: motion)
     for _ in range(3):
-        yield acting(words, element, **changes)
+        yield acting(words, element)
         words = words.replace("@", r"@.command")
         element = fj.control.FirstOrderLag(element, 0.1)
 
@@ -314,10 +297,6 @@ def step(limit, *others):
     return fj.Scene(bar, fj.State([0.0], [0.0]), (pd, *others), 4.0)
 
 
-def limited(limit):
-    return FIG7._replace(forces=(PD.replace(limit=np.broadcast_to(limit, 3)),))
-
-
 @dataclasses.dataclass
 class Unhashable:
     def __call__(self, *arguments):
@@ -331,14 +310,26 @@ class Rows(fj.Element):
         return -qd / len(self.rows)
 
 
-@dataclasses.dataclass
-class Plain:
-    number: Any
-
-
 class Pair(NamedTuple):
     left: Any
     right: Any
+
+
+def past_constructors():
+    """Yields elements with one wrong array each, and how the door refuses them."""
+    for part in PARTS:
+        for name, about in type(part).__dataclass_fields__.items():
+            rules, value = about.metadata.get("rules"), getattr(part, name)
+            if not isinstance(part, fj.Element) or not rules or not eqx.is_array(value):
+                continue
+            wrong = [(lambda a: a * np.nan, "")]
+            if rules["minimum"] == 0:
+                wrong.append((lambda a: -1 - a, ".* at least 0"))
+            if rules["shape"] == ("joint",):
+                wrong.append((lambda a: jnp.ones(2), "numbers for 3 joints, .* got 2"))
+            for change, words in wrong:
+                words = rf"forces\[0\]\.({name}|jump_ts): expected {words}"
+                yield spoilt(part, name, change), words
 
 
 LAG, SHAPED = fj.control.FirstOrderLag(DAMPER, 0.1), np.zeros((1, 2, 3))
@@ -348,138 +339,85 @@ RESET = forces.Reset(height, lambda t, q, qd, linkage: (q, qd))
 FIG5, RRR = fj.scenes.fig5(), fj.scenes.circle_scenes()["RRR"]
 ONES, FIXED = np.ones((2, 3)), diffrax.ConstantStepSize()
 FLAT = tuple(ONES[:, :2])  # of two joints
-PRICED = dict(loss=tuning.Tracking(effort=1.0))
+UNLIMITED = FIG7._replace(forces=(PD.replace(limit=np.full(3, np.inf)),))
 ERRORS = dict(loss=tuning.joint_errors)
 TWO, TWO_STARTS, SEEN = stacked(ARM), stacked(START), np.zeros((5, 3, 2))
 SHARED = "linkage, state0, forces"
 BARE = fj.Scene(ARM, START, (), 1.0)
 MORE = {
-    "step_measures": [
-        (rf"{name}: expected real numbers of shape", {name: value})
-        for name in ("change", "rate", "final")
-        for value in (np.zeros(2), "1", np.ones(5, complex))
-    ],
     "Linkage": [
         ("length: .* 4 real numbers for the ground and 3 moving", dict(length=ONES)),
         ("com: .* 3x2 real numbers for 3 moving links", dict(com=ONES)),
-        *each(r"mass: .* at least 0, got \[", "mass", [1, 1, -1]),
-        *each(r"inertia: .* at least 0, got \[", "inertia", [1, 1, -1]),
+        *((rf"{name}: .* at least 0, got \[", {name: [1, 1, -1]})
+          for name in ("mass", "inertia")),
         *each("topology: .* 1 to 8 letters", "topology", "RXR", [0, 1j]),
         *each("topology: .* joint that moves, got fixed", "topology", "FFF", [0] * 6),
         *each("topology: .* one real joint at most in each", "topology", [0, 1, 1, 1]),
     ],
     "simulate": [
-        *each(r"ts: .* for instance \[0, 2\.0\], .* 2\.0", "ts", 2.0),
-        *each("max_steps", "max_steps", 10**30),
         ("rtol, atol, max_step: expected none beside a stepsize_controller",
          dict(rtol=1e-6, stepsize_controller=FIXED)),
-        *each("linkage.mass", "linkage", spoilt(ARM, "mass", lambda a: -a)),
-        *each("linkage.length", "linkage", spoilt(ARM, "length", lambda a: a / 0)),
-        *each("linkage.topology", "linkage",
-              *(spoilt(ARM, "ef", change) for change in (
-                  lambda a: a * 0, lambda a: a * np.nan, jnp.ones_like))),
-        *each("linkage.locked", "linkage", spoilt(ARM, "locked", lambda a: a[0])),
+        *((f"linkage.{named}", dict(linkage=spoilt(ARM, name, change)))
+          for named, name, change in (
+              ("mass", "mass", lambda a: -a), ("length", "length", lambda a: a / 0),
+              ("topology", "ef", lambda a: a * 0), ("locked", "locked", lambda a: a[0]),
+          )),
         *((rf"state0\.{name}: expected .+, got ",
            dict(state0=START._replace(**{name: value})))
-          for name in ("q", "qd")
-          for value in (*WRONG, *(wrong for wrong, _ in wrong_numbers(ZERO, {})))),
-        # Ends and resets
+          for name in ("q", "qd") for value in (None, ZERO[:2], ZERO * 1j)),
         *each(r"until: .* got one of shape \(3,", "until", lambda t, q, *_: q),
-        *each(r"until: .* number, got \[.*\]", "until", lambda t, q, *_: [q[0]]),
-        *each("until: .* number, got 'a'", "until", returns("a")),
-        ("until.condition: expected a function", dict(until=lambda t: t), TypeError),
         ("until: expected jax.numpy", dict(until=lambda t, *_: 1 - bool(t)), TypeError),
         ("stepsize_controller: .* a condition that ends the motion",
          dict(until=height, stepsize_controller=FIXED)),
-        reset(lambda t, q, *_: q, RESET.then, r"when: expected .* shape \(3,"),
-        reset(lambda t, q, *_: q[0] > 0, RESET.then, "when: .* of type bool"),
-        reset(height, returns(ZERO), "then: .*, got no pair"),
-        reset(height, returns((ZERO, ONES)), r"then: .* \[\(3,\), \(2, 3\)\]"),
-        reset(height, lambda q, qd: q, "then: expected a function", TypeError),
+        acting(r"@.when: .* shape \(3,", forces.Reset(lambda t, q, *_: q, RESET.then)),
+        *(acting("@.then: expected", forces.Reset(height, returns(value)))
+          for value in (ZERO, (ZERO, ONES))),
         *(acting("stepsize_controller: expected an adaptive", element,
                  stepsize_controller=FIXED, dt0=0.01) for element in (FRICTION, RESET)),
-        # Elements
         *(acting("@: expected", DAMPER, returns(tau)) for tau in (
-            np.zeros(2), np.zeros((3, 1)), 0.0, ZERO * 1j, ZERO > 0, None, "text",
-            (ZERO, ZERO),
-        )),
-        acting("forces: expected one HardStops", STOPS, STOPS),
-        acting("forces: expected one PrescribedMotion", MOVED, MOVED),
-        acting("@.joints: expected 1 to 3, got 4", BRAKE.replace(joints=4)),
-        acting("@.joints: expected 1 to 3, got 4", MOVED.replace(joints=4)),
-        acting("@.reference: .* of 3", MOVED.replace(reference=lambda *_: FLAT)),
+            np.zeros(2), 0.0, ZERO * 1j, None, (ZERO, ZERO))),
+        *(acting(f"forces: expected one {type(element).__name__}", element, element)
+          for element in (STOPS, MOVED)),
+        *(acting("@.joints: expected 1 to 3, got 4", element.replace(joints=4))
+          for element in (BRAKE, MOVED)),
         acting("@.command: expected an array of 3", LAG.replace(command=returns(5.0))),
-        acting("@.level: .* numbers for 3 joints", forces.JointFriction(ONES[:, :2])),
-        *(acting("@.level: .* array of n", forces.JointFriction(returns(value)))
-          for value in (SHAPED, "much")),
-        acting("@.level: expected it to return numbers for 3 joints",
-               forces.JointFriction(returns(np.ones(2)))),
-        acting(r"@.coefficient: .* 3 joints.*got 2\.$", fj.JointDamper([1.0, 1])),
-        acting("@.coefficient: .* 3 joints.*_axes", stacked(fj.JointDamper(ZERO))),
-        # `equinox.tree_at` passes by the constructor.
-        *(acting(rf"@.{name}: .* at least 0", spoilt(HELD, name, change))
-          for name in ("kp", "limit")
-          for change in (lambda a: -a, lambda a: a * np.nan)),
-        # References
-        *(row for motion in (None, ZERO, FLAT, (ZERO, None), (ZERO * 1j, ZERO))
-          for row in following("@.reference", lambda t, linkage, it=motion: it)),
+        *(acting(f"@.level: {words}", forces.JointFriction(returns(value)))
+          for words, value in ((".* array of n", SHAPED), (".* 3 joints", FLAT[0]))),
+        *(row for it in (None, ZERO, FLAT) for row in following(it)),
+        acting("@.reference: .* of 3", MOVED.replace(reference=lambda *_: FLAT)),
         acting("@.reference: .* reach .*, got ",
                PD.replace(reference=fj.CircleTask([99, 9])), linkage=FIG5.linkage),
     ],
     "sweep": [
         (SHARED, dict(linkage=ARM, state0=START)),
         (SHARED, dict(linkage=TWO, state0=stacked(START, 3))),
-        (SHARED, dict(linkage=ARM, state0=fj.State(np.ones((2, 3)), np.ones((4, 3))))),
         (SHARED, jax.tree.map(lambda a: a[:0], dict(linkage=TWO, state0=TWO_STARTS))),
-        *((rf"linkage\.{n}", dict(linkage=spoilt(TWO, n, lambda a: a[None, None])))
-          for n in ("ef", "com", "mass", "gravity")),
-        *((rf"state0\.{name}", dict(state0=TWO_STARTS._replace(**{name: value})))
-          for name in ("q", "qd")
-          for value in (1.0, ZERO[:2], SHAPED, "one", [None] * 3)),
-        *each(r"state0\.q", "state0", (ONES > 0, ONES), (ONES * 1j, ONES)),
+        ("linkage.gravity", dict(linkage=spoilt(TWO, "gravity", lambda a: a[None]))),
+        *((r"state0\.q", dict(state0=TWO_STARTS._replace(q=value)))
+          for value in (1.0, ZERO[:2], SHAPED, ONES > 0)),
         *each("linkage: .*\\*arms\\) stacks", "linkage", [ARM, ARM]),
         acting(r"linkage, state0, forces.* none on any \(pass forces_axes",
                stacked(fj.JointDamper(1.0)), linkage=ARM, state0=START),
-        acting(".* as the linkage has, got 200", fj.JointDamper(np.ones(200))),
-        acting(r".*state0\.q: 2, .*\[0\]\.coefficient: 3\.$", fj.JointDamper(ZERO),
-               forces_axes=0),
         acting("forces", Unhashable()),
-        *(acting("@", returns(tau)) for tau in (np.zeros(2), ZERO * 1j, None)),
         acting("forces, forces_axes: .*forces_axes=0", Rows(np.ones(2)), forces_axes=0,
                error=TypeError),
-        *each("reduce", "reduce", Unhashable(), lambda motion: motion.q,
-              *(lambda *_, it=value: (1.0, it) for value in ("q", jax.random.key(0)))),
+        *each("reduce", "reduce", lambda motion: motion.q,
+              lambda *_: (1.0, jax.random.key(0))),
         ("store", dict(shard=1, of=2)),
-        ("shard", dict(shard=2, of=2, store="folder")),
         ("sweep.* unexpected .*'rtoll'", dict(rtoll=1e-6), TypeError),
     ],
     "tune": [
-        *each("factor", "factor", 1.0, "4"),
         ("factor", dict(factor=2.0, bounds=(ONES, ONES))),
-        *each("method: expected one of", "method", "adam"),
         *each("over: expected an ensemble", "over", "worst"),
-        *each("ensemble: expected scenes stacked", "ensemble", FIG7),
         *each(r"ensemble\[0\]: expected joints", "ensemble", tuning.stacked([RRR])),
-        *each("loss: expected a callable", "loss", tuning.Tracking),
-        *(("loss: expected finite limits", dict(scene=limited(limit), **PRICED))
-          for limit in (np.inf, [0, 1, 1])),
         ("loss: expected finite limits",
-         dict(ensemble=tuning.stacked([FIG7, limited(np.inf)]), **PRICED)),
-        *each("bounds", "bounds", (1, 2, 3), (ONES, ONES[:, :2]), (ONES, 2 * ONES),
-              (0 * ONES, 1e9 * ONES)),
-        *each("bounds: expected the scene's", "bounds", (9 * ONES, ONES)),
+         dict(loss=tuning.Tracking(effort=1), scene=UNLIMITED)),
+        *each("bounds", "bounds", (1, 2, 3), (ONES, ONES[:, :2]), (ONES, 2 * ONES)),
         *each("scene: expected exactly one PDController", "scene", FIG5),
-        *each(r"scene\.t1", "scene", *(FIG7._replace(t1=t) for t in (-1, np.nan, "a"))),
-        *each("linkage", "scene", FIG7._replace(linkage=None)),
-        *each(r"scene\.forces", "scene", FIG7._replace(forces=PD)),
-        *(row for value in ("a", None, 1j, (1.0, 2.0, "b")) for row in
-          each(r"loss\(scene, solution\): expected a", "loss", lambda *_, v=value: v)),
+        *each(r"loss\(scene, solution\): expected a", "loss", lambda *_: "a"),
     ],
-    "stacked": [
-        *each("scenes: expected a list", "scenes", RRR),
-        *each(r"scenes\[1\]: expected one like scenes\[0\]", "scenes", [FIG7, FIG5],
-              [RRR, RRR._replace(forces=(*RRR.forces, DAMPER))]),
-    ],
+    "stacked": each(r"scenes\[1\]: expected one like scenes\[0\]", "scenes",
+                    [FIG7, FIG5], [RRR, RRR._replace(forces=(*RRR.forces, DAMPER))]),
     "tune_within": [
         (".* its controller to track a task with a `tip`", dict(scene=step(0.1))),
         (r"limits.overshoot: .* for 1 joints", dict(
@@ -491,90 +429,46 @@ MORE = {
     "fit": [
         *each(r"scene_at\(...\): expected a Scene", "scene_at", lambda p: p["a"]),
         *each("start: expected a value for 'b'", "scene_at", lambda p: p["b"]),
-        *each("start: expected a dict", "start", {}),
-        *each("start: expected names", "start", {1: 2.0}),
-        *each(r"start\['a'\]: expected", "start", *({"a": value} for value in (
-            np.nan, "heavy", [[1], [2, 3]]))),
+        *each("observed: expected a recording for each", "scene_at", [hold] * 2),
+        *each(r"start\['a'\]: expected", "start", {"a": np.nan}, {"a": [[1], [2, 3]]}),
         *each("scale: expected a size for 'a'", "start", {"a": 0.0}),
-        *each("scale: expected a size for 'key 0", "start", DICTS[1]),
-        *each(r"scale\['a'\]: expected a real number", "scale", {"a": 0}),
-        *each("scale: expected a dict with names from", "scale", {"b": 1}),
-        *each("bounds: expected a dict with names from", "bounds", {"b": (1, 2)}),
         *each(r"bounds\['a'\]: expected bounds around", "bounds", {"a": (2, 3)}),
-        *each(r"bounds\['a'\]: expected \(least, greatest\)", "bounds", {"a": 2}),
         *each("ts: expected increasing times, two", "ts", TS[::-1], TS[:1]),
-        *each("observed: expected an array of real numbers", "observed", "film"),
-        *each("observed: expected finite", "observed", SEEN + np.inf),
         *each("observed: expected a row for each of the 5", "observed", SEEN[:3], 3.0),
         *each("observed: expected the shape", "observed", SEEN[:, :2]),
         *each("observed: expected more readings than the 1", "observed", SEEN * np.nan),
-        *each("noise: expected a real number", "noise", 0),
         *each("noise: expected one number, or an array that", "noise", np.ones((4, 2))),
-        *each("observed: expected a recording for each", "scene_at", [hold] * 2),
-        *each(r"validate: expected \(scene_at, observed\)", "validate", SEEN),
-        *each(r"validate\[0\]: expected a callable", "validate", (3, SEEN)),
         *each(r"validate\[1\]: expected a row for each", "validate", (hold, SEEN[:3])),
-        *each(r"validate\[1\]: expected rec", "validate",
-              *((lambda p: FIG7, seen) for seen in (SEEN[:, :2], SEEN * np.nan)),),
-        *each(r"validate\[1\]: expected a rec", "validate", ([hold] * 2, SEEN[None])),
     ],
-    "fit_each": [
-        *each("observed: expected recordings", "observed", 3.0),
-        (".*unexpected keyword argument 'tolerance'", dict(tolerance=1), TypeError),
-    ],
+    "fit_each": each("observed: expected recordings", "observed", 3.0),
     "next_motion": [
-        *each(r"start\['a'\]: expected", "start", {"a": [[1.0], [2.0, 3.0]]}),
         *each(r"bounds\['a'\]: expected", "start", {"a": 9.0}),
-        *each("bounds: expected a dict with names from", "bounds", {"tau": (-1, 1)}),
         *each("bounds: expected finite ones for all of", "bounds", {}),
-        *each("noise: expected a real number", "noise", 0),
-        *each("ts: expected increasing times", "ts", TS[::-1]),
-        *each(r"scale\['a'\]: expected a real number", "scale", {"a": 0}),
-        *each("start: .* between -1 and 1 .* entry", "within", lambda s, m: m.q + 9),
+        ("start: .* between -1 and 1 .* entry", dict(
+            experiment=lambda a: lambda p: step(0.1), within=lambda s, m: m.q + 9)),
     ],
-    "simulate_sampled": [
-        *each("forces", "forces", [LAG]),
-        ("noise, key", dict(noise=(0.1, 0.1))),
-        *each("delay", "delay", -0.1),
-    ],
-    "step": [acting("forces: expected elements without", LAG)],
+    "simulate_sampled": each("forces", "forces", [LAG])
+    + [("noise, key", dict(noise=(0.1, 0.1)))],
     "ode_term": [
-        *((words, dict(scene=BARE._replace(forces=(element,)))) for words, element in (
-            *((".*no element that holds", held) for held in (FRICTION, STOPS, BRAKE)),
-            *((".*no PrescribedMotion, Reset, Until or", one) for one in (
-                MOVED, elements.HOLDING["taken"], RESET, fj.simulation.Until(height),
-            )),
-            (".*an array of 3 real numbers", returns(0.0)),
-        )),
+        ("scene.*: expected .*no ", dict(scene=BARE._replace(forces=(element,))))
+        for element in (FRICTION, STOPS, BRAKE, MOVED, elements.HOLDING["taken"], RESET)
     ],
-    "gains_from_frequency": [
-        *each("frequency: .* 3 real numbers for 3 joints", "frequency", [1, 2]),
-        *each(r"frequency: .* above 0 \[rad/s\]", "frequency", 0),
-        *each("damping_ratio: .* at least 0", "damping_ratio", -0.1),
-    ],
+    "gains_from_frequency": each("frequency: .* for 3 joints", "frequency", [1, 2])
+    + each(r"frequency: .* above 0 \[rad/s\]", "frequency", 0),
     "open_loop": [
         *each(r"joint: expected one of \(1, 2, 3\), got [04T]", "joint", 0, 4, True),
-        acting("forces: expected elements", LAG),
-        *each("controller: expected a force element", "controller", 3.0),
         *each("controller: expected one that", "controller", MOVED),
         *each("controller: expected no element that holds", "controller", FRICTION),
     ],
     "from_chain": each("topology: expected no fixed pair", "topology", "RFR"),
-    "reachable": each("reference", "reference", LINE, HELD, references.Laps(1.0),
-                      lambda t, linkage: None),
-    "reach_margin": each("task", "task", LINE, HELD),
+    "reachable": each("reference", "reference", LINE, HELD, lambda t, linkage: None),
     "tip_errors": each("scene", "scene", BARE._replace(forces=(HELD,))),
+    "step": [acting("forces: expected elements without", LAG)],
     **{name: [acting("forces: expected elements without", e) for e in (LAG, MOVED)]
-       for name in ("linearize", "equilibrium")},
-    "closed_loop_modes": [
-        *(acting("forces: expected elements without", e) for e in (LAG, MOVED)),
-        *each("solution: .* one motion", "solution", stacked(MOTION)),
-    ],
+       for name in ("linearize", "equilibrium", "closed_loop_modes")},
     "response": [
-        acting("forces: expected one controller", DAMPER),
         acting("forces: expected one controller", HELD, HELD),
         *each("since: expected a time before .* 1 s", "since", 6.0),
-        *each("solution: expected one motion", "solution", stacked(MOTION)),
         *each("solution: .* that reached its end", "solution", NOWHERE),
         acting("solution.own: expected the states",
                fj.control.PIDController(1.0, 1.0, 1.0, 1.0, hold)),
@@ -582,86 +476,69 @@ MORE = {
     "to_xarray": each("solution.ts: expected the same times", "solution",
                       spoilt(stacked(MOTION), "ts", lambda a: a.at[1].add(1.0))),
     "to_mjcf": [
-        *each("linkage: expected one Linkage", "linkage", stacked(ARM)),
-        *(acting(words, DAMPER, element) for words, element in (
+        acting(words, DAMPER, element) for words, element in (
             (".*got GravityFeedforward", fj.control.GravityFeedforward(1, 1, 1, TASK)),
             (".*states that follow", LAW),
-            (".*got function", returns(ZERO)),
             (".*expected one JointDamper", DAMPER),
             (".*no damping of a cable", elements.PLAIN["cable"]),
             (".*link: expected", fj.Wrench(fj.Point(5), [1, 0])),
-            ("@: expected one friction per joint, .* got JointFriction",
-             forces.JointFriction([[1] * 3, [2] * 3])),
-            ("@: expected one friction per joint, .* got JointFriction",
-             forces.JointFriction(forces.stribeck(1, 2, 3))),
-        )),
+            *(("@: expected one friction per joint, .* got JointFriction",
+               forces.JointFriction(level))
+              for level in ([[1] * 3, [2] * 3], forces.stribeck(1, 2, 3))),
+        )
     ],
     "view": [
-        *((name, dict(linkage=arm, solution=motion)) for name, arm, motion in (
-            ("linkage", {"a": ARM}, MOTION), ("linkage", {"a": ARM}, {"b": MOTION}),
-            (r"linkage\['a'\]", "RRR", {"a": MOTION}), ("linkage", BARE, {"a": MOTION}),
-            ("linkage", {"a": BARE}, MOTION), ("linkage", {"a": BARE}, {"b": MOTION}),
-            ("solution", ARM, {}), ("solution", ARM, {3: MOTION}),
-            ("solution", ARM, NOWHERE), (r"solution\['a'\]", ARM, {"a": 3}),
-        )),
-        *each("forces", "forces", {"a": ()}),
+        ("linkage", dict(linkage={"a": BARE}, solution={"b": MOTION})),
+        *each("solution", "solution", {}, NOWHERE, {"a": 3}),
         ("forces", dict(solution={"a": MOTION}, forces={"b": ()})),
-        ("forces", dict(linkage=BARE, forces=())),
-        ("forces", dict(linkage={"a": BARE}, solution={"a": MOTION}, forces={"a": ()})),
         *each("path", "path", "", Path(__file__).parent, "no such folder/a.html"),
     ],
-    "tracking": each(r"solutions\['a'\]", "solutions", {"a": stacked(MOTION)})
-    + each("solutions", "solutions", {}),
-    **{name: each(r"motions\['a'\]", "motions", {"a": MOTION}, {"a": ("RRR", MOTION)},
-                  {"a": (ARM, TWO_JOINTS)}) + each("motions", "motions", {})
-       + each("forces", "forces", {"b": ()})
+    "tracking": each(r"solutions\['a'\]", "solutions", {"a": stacked(MOTION)}),
+    **{name: each(r"motions\['a'\]", "motions", {"a": MOTION}, {"a": (ARM, TWO_JOINTS)})
+       + each("motions", "motions", {}) + each("forces", "forces", {"b": ()})
        for name in ("topology_grid", "animate_grid")},
     **{name: each("solution", "solution", stacked(MOTION), NOWHERE) for name in (
         "animate", "chrono_cyclograph", "motion_profile", "energy_profile",
         "energy_stack", "tracking_by_error")},
-    # Parts
-    "PIDController": each("ki: expected 0 where kp is", "kp", [1, 1, 0.0]),
-    "DCMotor": each("inductance: expected above 0 in all", "inductance", [0, 1, 1]),
+    # Conditions of parts
+    **{name: [(words, changes)] for name, words, changes in (
+        ("PIDController", "ki: expected 0 where kp is", dict(kp=[1, 1, 0.0])),
+        ("DCMotor", "inductance: expected above 0 in all", dict(inductance=[0, 1, 1])),
+        ("JointStops", "lower: expected less than upper", dict(lower=9)),
+        ("Brake", "begin: expected less than end", dict(begin=2.0)),
+        ("Point", "link: expected 0", dict(link=9)),
+        ("Step", "after: expected as many numbers as be", dict(before=[0, 1])),
+        ("Laps", "period: expected not zero", dict(period=0)),
+        ("CircleTask", "period: expected not zero", dict(period=0)),
+        ("Travel", "profile: expected one of", dict(profile="linear")),
+        ("Spline", "points: expected three or more", dict(points=ROWS[:2, :2])),
+    )},
     "JointFriction": [
         ("level: expected .*, or 2 such rows", dict(level=np.ones((3, 2)))),
-        ("static: expected .* rows", dict(static=np.ones((3, 2)))),
-        ("static: expected at least the level", dict(level=2.0, static=1.0)),
-        ("static: expected at least the level", dict(level=[[1], [2]], static=1)),
+        *(("static: expected at least the level", dict(level=level, static=1.0))
+          for level in (2.0, [[1], [2]])),
         (r"level, static: .* of one length, got shapes \(3,\), \(2,\)",
          dict(level=[1, 2, 3], static=[1, 2])),
         ("static: expected none beside", dict(static=2, speed=1)),
     ],
-    "HardStops": [
-        *each("lower: expected less than upper", "lower", 9),
-        *each("restitution: expected at most 1", "restitution", 1.1),
-    ],
-    "JointStops": each("lower: expected less than upper", "lower", 9),
-    "Brake": each("begin: expected less than end", "begin", 2.0),
+    "HardStops": each("lower: expected less than upper", "lower", 9)
+    + each("restitution: expected at most 1", "restitution", 1.1),
     "Payload": [
         ("begin: expected less than", dict(begin=2, end=1)),
         ("velocity: expected two or", dict(velocity=[1])),
         ("velocity: expected zeros", dict(velocity=[1, 0], begin=None)),
         ("place: expected a point of a moving link", dict(place=fj.Point(0))),
     ],
-    "EffortHistory": [
-        *each("ts: expected increasing", "ts", [0, 0, 1, 2], []),
-        *each("tau: expected 4 rows", "tau", np.ones((3, 3))),
-        *each("tau: expected an array", "tau", np.ones(4)),
-    ],
-    "Point": each("link: expected 0", "link", 9),
+    "EffortHistory": each("ts: expected increasing", "ts", [0, 0, 1, 2], [])
+    + each("tau: expected 4 rows", "tau", np.ones((3, 3))),
     "Pulse": [
         ("begin: expected less than end", dict(begin=2)),
         ("inside: expected as", dict(outside=[0, 1], inside=[0, 1, 2])),
     ],
-    "Step": [("after: expected as many numbers as be", dict(before=[0, 1]))],
     "Ramp": [
         ("ts: expected two or more increasing", dict(ts=[0.0], q=[[1.0]])),
         ("q: expected 2 rows, one per time, got 1", dict(ts=[0, 1], q=[[1.0]])),
     ],
-    **{name: each("period: expected not zero", "period", 0)
-       for name in ("Laps", "CircleTask")},
-    "Travel": each("profile: expected one of", "profile", "linear"),
-    "Spline": each("points: expected three or more", "points", ROWS[:2, :2]),
 }  # fmt: skip
 
 # What traces or compiles much
@@ -680,36 +557,22 @@ KNOWN_ALONE = {
 ENDLESS = []
 ENDLESS.append(ENDLESS)
 (OF_A_FUNCTION,) = forces.elements_on(ARM, (height,))
-ALIKE = type("JointDamper", (eqx.Module,), {})()
-WORDS = [
-    dataclasses.make_dataclass(name, ["a"], namespace={"__module__": "own"})(1.0)
-    for name in ("fdof_jax", "value", "tuple", "dict")
-]
 UNSAVED = [
-    (hold, "equinox.Module .* got <function"), (DAMPER.__call__, "bound method"),
-    (Rows, "class .*Rows"), (object(), "object"), (b"abc", "b'abc'"),
-    ({1: 2}, r"dicts with text keys, .* got \{1: 2\}"), ("inf", "'inf'"),
-    *((value, "real numbers") for value in (
-        np.array([1j]), np.array([None]), np.array(["a"]), np.zeros(2, [("a", "f8")]),
-        DELETED, jax.random.key(3),
-    )),
+    (hold, "equinox.Module .* got <function"), (Rows, "class .*Rows"), ("inf", "'inf'"),
+    ({1: 2}, r"dicts with text keys, .* got \{1: 2\}"), (DELETED, "real numbers"),
     (np.ma.zeros(2), "real numbers.*masked"), (np.zeros((0, 3)), "at least one"),
     (MOTION, "to_xarray .* got Solution"), (OF_A_FUNCTION, "public class, .*Foreign"),
-    (ALIKE, "another name, .*JointDamper"), *((w, "of another name") for w in WORDS),
+    *((dataclasses.make_dataclass(name, ["a"], namespace={"__module__": "own"})(1.0),
+       "of another name") for name in ("JointDamper", "fdof_jax", "value", "dict")),
     (2**64, "at most 64 bits, got 18446744073709551616"),
-    (-HUGE, "at most 64 bits, got a value of type int"),
-    (spoilt(ARM, "mass", lambda a: -a), "mass: .* at least"),
     (eqx.nn.MLP(6, 3, 8, 1, key=jax.random.key(0)),
      "equinox.tree_serialise_leaves .*dtype, key"),
     (TWO, "equinox.tree_serialise_leaves .*; topology: .*2, 6"),
-    (object.__new__(Plain), "number"),
 ]  # fmt: skip
 MORE["save"] = [
     ("tree: expected .*without end", dict(tree=ENDLESS)),
     *((rf"tree\.forces\[1\]\.right: expected .*{words}.*\.$",
        dict(tree=FIG7._replace(forces=(DAMPER, Pair(1.0, value)))))
-      for value, words in UNSAVED),
-    *((rf"tree\['a'\]\[0\]: expected .*{words}.*\.$", dict(tree={"a": [value]}))
       for value, words in UNSAVED),
 ]  # fmt: skip
 
@@ -726,54 +589,25 @@ AT = r"tree\[1\]"
 UNREADABLE = {
     # No JSON, or that of other programs
     "": "expected JSON, got .*line 1",
-    "q,qd\n1,2\n": "expected JSON",
     of('"value": 1') + "{}": "expected JSON, got Extra data",
     of('"value": NaN'): 'expected JSON, got NaN, which is no number \\("inf"',
-    of('"value": -Infinity'): "expected JSON, got -Infinity",
     of('"value": 1e999'): "expected JSON, got 1e999",
-    of(f'"value": {"9" * 5000}'): "expected JSON, got .*4300 digits",
     of('"dict": {"a": 1, "a": 2}'): "name twice in one object, of .*'a', 'a'",
-    "[" * 100_000: "expected less nesting",
     '{"a":' * 100_000: "expected less nesting",
-    "[]": "version of the library, .* got None",
-    '{"asset": {"version": "2.0"}}': "version of the library, .* got None",
-    '{"fdof_jax": 0.2, "value": 1}': "version of the library, .* got 0.2",
     '{"fdof_jax": "new", "value": 1}': "version of the library, .* got 'new'",
     '{"fdof_jax": "0.99.1", "Unheard": {}}': "or an older version, got '0.99.1'",
-    '{"fdof_jax": "7.0", "value": 1}': "or an older version, got '7.0'",
     # Objects
-    '{"fdof_jax": "0.2"}': r"tree: expected an object by its name alone, got \[\]",
     of('"State": {}, "Scene": {}'): r"its name alone, got \['State', 'Scene'\]",
     of('"value": {"value": 1}'): "tree.value: expected named arguments, got 1",
-    of('"value": 1, "Scene": {}'): r"its name alone, got \['value', 'Scene'\]",
-    of('"tuple": {}'): "tree: expected a class of .*got 'tuple'",
-    of('"batch": [1]'): "tree.batch: expected named arguments, got .*1",
-    element("JointDamper", "[1]"): rf"{AT}.JointDamper: expected named .* got \[1\]",
     element("JointDamper", "{}"): f"{AT}: expected the arguments .*'coefficient'",
     element("JointDamper", '{"gain": 1}'): f"{AT}: expected the arguments .*'gain'",
     element("State", '{"q": [1]}'): f"{AT}: expected the arguments of State.*'qd'",
     element("JointDamper", '{"coefficient": -1}'): f"{AT}.coefficient: .*at least 0",
-    element("JointDamper", '{"coefficient": "nan"}'): f"{AT}.coefficient: .*got nan",
-    element("JointDamper", '{"coefficient": "1"}'): f"{AT}.coefficient: .*got '1'",
-    element("JointDamper", '{"coefficient": true}'): f"{AT}.coefficient: .*got True",
-    element("JointDamper", '{"coefficient": null}'): f"{AT}.coefficient: .*got None",
     element("JointStops", '{"lower": 1, "upper": 0}'): f"{AT}.lower: .*less than upper",
-    element("PDController", '{"kp": 1, "kd": 1, "limit": 1, "reference": 3}'): (
-        f"{AT}.reference: expected a callable"
-    ),
     element("Wrench", '{"point": {"Point": {"link": 9}}}'): f"{AT}.point.link: .*got 9",
-    element("SpringDamper", '{"a": 1, "b": 2}'): f"{AT}.a: expected a Point",
-    element("Travel", '{"duration": 1, "profile": "os"}'): f"{AT}.profile: .*got 'os'",
-    element("PrescribedMotion", '{"joints": [1.5], "reference": 3}'): f"{AT}.joints: ",
     element("Element", "{}"): f"{AT}: expected the arguments .*abstract",
     # Arrays
-    of('"value": [1, [2]]'): "tree: expected numbers in lists of one length",
-    of('"value": [[1, 2], [3]]'): "tree: expected numbers in lists of one length",
     of('"value": [1, "x"]'): r"tree: expected numbers .*got \[1, 'x'\]",
-    of('"value": [1, null]'): r"tree: expected numbers .*got \[1, None\]",
-    of(f'"value": [1, {2**70}]'): "tree: expected numbers .* 64 bits",
     of(f'"value": [{2**63}, -1]'): "tree: expected numbers .* 64 bits",
-    of(f'"value": [{2**63}, 0.5]'): "tree: expected numbers .* 64 bits",
-    of('"value": ["x", [1, {"Scene": {}}]]'): rf"{AT}: expected numbers",
     of(f'"value": {"[" * 99}1{"]" * 99}'): "tree: expected numbers",
 }

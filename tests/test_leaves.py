@@ -1,19 +1,24 @@
 """Leaves import the library as a user does, and no more than their names are shown."""
 
 import ast
+import functools
 from pathlib import Path
 
 import pytest
 from test_package import FOLDER, LEAVES, NAMESPACES
 
-PUBLIC = {Path(room.__file__): room for room in NAMESPACES}
+PUBLIC = {Path(room.__file__): {*dir(room)} for room in NAMESPACES}
 
 
+def leaf_of(place):
+    first, *_ = *place.relative_to(FOLDER).parts, ""
+    return LEAVES.get(first.removesuffix(".py"))
+
+
+@functools.cache
 def imports(path):
-    """Yields where each import of the library is from, and the names that are taken.
-
-    For a file or a folder that is taken itself there are no names.
-    """
+    """Returns the file of each import of the library, and its names, if not itself."""
+    found = []
     for line in ast.walk(ast.parse(path.read_text())):
         if isinstance(line, ast.Import):
             assert not any(n.name.startswith("fdof_jax") for n in line.names), path
@@ -25,36 +30,24 @@ def imports(path):
                 for name in (name.name for name in line.names):
                     module = place / name
                     alone = module.is_dir() or module.with_suffix(".py").exists()
-                    yield (module, []) if alone else (place, [name])
-
-
-def leaf_of(place):
-    first, *_ = *place.relative_to(FOLDER).parts, ""
-    return LEAVES.get(first.removesuffix(".py"))
-
-
-@pytest.mark.parametrize("leaf", sorted({*LEAVES.values()}))
-def test_a_leaf_imports_public_names_alone(leaf):
-    files = [path for path in FOLDER.rglob("*.py") if leaf_of(path) == leaf]
-    assert files
-    for path in files:
-        for place, names in imports(path):
-            if leaf_of(place) == leaf:
-                continue
-            file = place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
-            assert file in PUBLIC, (path, file)
-            assert {*names} <= {*dir(PUBLIC[file])}, (path, names)
+                    source, names = (module, set()) if alone else (place, {name})
+                    inside = source / "__init__.py" if source.is_dir() else ""
+                    found.append((Path(inside or f"{source}.py"), names))
+    return found
 
 
 @pytest.mark.parametrize("leaf", sorted({*LEAVES.values()}))
-def test_rooms_only_show_names_of_a_leaf(leaf):
-    shown = set()
+def test_a_leaf_imports_public_names_and_rooms_only_show_its_own(leaf):
+    taken, shown = set(), set()
     for path in FOLDER.rglob("*.py"):
-        if leaf_of(path) == leaf:
-            continue
-        for place, names in imports(path):
-            if leaf_of(place) == leaf:
-                assert path.name == "__init__.py", (path, place)
-                assert {*names} <= {*PUBLIC[path].__all__}, (path, names)
-                shown.add(place)
-    assert shown
+        within = leaf_of(path) == leaf
+        for file, names in imports(path):
+            if within == (leaf_of(file) == leaf):
+                continue
+            if within:
+                assert names <= PUBLIC[file], (path, file)
+                taken |= names
+            else:
+                assert path.name == "__init__.py" and names <= PUBLIC[path], path
+                shown.add(file)
+    assert taken and shown

@@ -1,37 +1,81 @@
-"""A sweep equals jax.vmap(simulate), member by member, or keeps what is asked for."""
+"""A sweep equals jax.vmap(simulate), member by member: its chunks and its programs."""
 
+import contextlib
 import functools
+import os
+import socket
+import subprocess
 import sys
+from pathlib import Path
+from typing import Any
 
-import chains
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import xarray
 from elements import SHORT
 from hard.scenes import Breaking
-from helpers import random_linkage
-from modes import ADJOINT
-from sweep_batch import (
-    CHUNK,
-    FAILED,
-    FAST,
-    NAN_LATER,
-    NAN_START,
-    SETTINGS,
-    SPENT,
-    TS,
-    alone,
-    run,
-    single_links,
-    successful,
-)  # fmt: skip
+from jax.experimental.compilation_cache import compilation_cache
+from modes import ADJOINT, LOOPS
+from sweep_batch import CHUNK, FAILED, FAST, SETTINGS, TS, alone, run
 
 import fdof_jax as fj
-from fdof_jax.batches import devices
-from fdof_jax.steps.looped_dopri8 import LoopedDopri8
+from fdof_jax.base import configuration
+from fdof_jax.batches import chunks, devices
+
+LANES = 64  # enough for a slow member to be stopped
+PENDULUM = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[0.1])
+DAMPER = fj.JointDamper(1.0)
+
+
+def pendulums(speeds):
+    """Returns pendulums that start level, at these speeds."""
+    qd = np.reshape(speeds, (-1, 1))
+    return PENDULUM, fj.State(np.zeros_like(qd), qd)
+
+
+def sweep_of(speeds, **keywords):
+    return fj.sweep(*pendulums(speeds), TS, **{**SETTINGS, **keywords})
+
+
+@contextlib.contextmanager
+def setting(name, value):
+    """Has another setting of JAX in all threads for a while."""
+    before = getattr(jax.config, name)
+    jax.config.update(name, value)
+    yield
+    jax.config.update(name, before)
+
+
+@pytest.fixture
+def solved(monkeypatch):
+    """Returns a list of the members in each chunk from here on."""
+    found, original = [], chunks.solve
+
+    def recorded(program, moving, shared):
+        if len(moving[0]) != chunks._FORECASTS:
+            found.append(moving)
+        return original(program, moving, shared)
+
+    monkeypatch.setattr(chunks, "solve", recorded)
+    return found
+
+
+@pytest.fixture
+def traces(monkeypatch):
+    """Returns a list of the traces of motions, and of forecasts, from here on."""
+    found = []
+    for name in ("solve_motion", "forward_dynamics"):
+
+        def counted(*arguments, name=name, original=vars(chunks)[name]):
+            found.append(name)
+            return original(*arguments)
+
+        monkeypatch.setattr(chunks, name, counted)
+    return found
 
 
 def assert_alike(tree, other):
@@ -41,293 +85,130 @@ def assert_alike(tree, other):
         assert (a.shape, a.dtype) == (b.shape, b.dtype)
 
 
+# Members
+
+
 def test_members_equal_single_simulations(batch, clean):
     """Equality of vmap with single motions is in test_one_compilation.py."""
     simulate = lambda linkage, state0, forces: fj.simulate(
         linkage, state0, TS, forces, throw=False, **SETTINGS
     )
     assert_alike(clean, jax.eval_shape(jax.vmap(simulate), *batch))
-    assert successful(clean).all()
+    assert (clean.outcome == "successful").all()
     for member in range(len(clean.q)):
         single = alone(batch, member)
         np.testing.assert_array_equal(clean.ts[member], single.ts)
         np.testing.assert_allclose(clean.q[member], single.q, rtol=1e-8, atol=1e-8)
         np.testing.assert_allclose(clean.qd[member], single.qd, rtol=1e-7, atol=1e-7)
         # A batch rounds differently, which may tip a step or two.
-        np.testing.assert_allclose(
-            clean.stats["num_steps"][member], single.stats["num_steps"], rtol=0, atol=5
-        )
+        steps = clean.stats["num_steps"][member]
+        np.testing.assert_allclose(steps, single.stats["num_steps"], rtol=0, atol=5)
 
 
-# Members that differ from the others
-
-
-def test_failed_members_have_their_own_results(mixed, swept):
-    results = diffrax.RESULTS
-    assert np.flatnonzero(~successful(swept)).tolist() == FAILED
-    for member, result in (
-        (NAN_START, results.nonfinite),
-        (NAN_LATER, results.nonfinite),
-        (SPENT, results.max_steps_reached),
-    ):
-        assert jax.tree.map(lambda a, m=member: a[m], swept.result) == result
-        if member != NAN_START:  # alone, a start of NaN is refused
-            assert alone(mixed, member).result == result
-    assert swept.stats["num_steps"][SPENT] == SETTINGS["max_steps"]
-
-
-def test_failed_members_are_nan_from_there_on(swept, clean):
-    assert np.isnan(swept.q[NAN_START]).any(axis=-1).all()
+def test_members_that_fail_harm_no_other(mixed, swept, clean):
+    nan_start, nan_later, spent = FAILED
+    expected = np.full(len(clean.q), "successful", object)
+    expected[FAILED] = "not finite", "not finite", "out of steps"
+    np.testing.assert_array_equal(swept.outcome, expected)
+    for member in (nan_later, spent):  # alone, a start of NaN is refused
+        assert alone(mixed, member).outcome == expected[member]
+    assert np.isnan(swept.q[nan_start]).all() and np.isnan(swept.q[spent][-1]).all()
     # No step comes up to 1 s itself.
-    early, late = TS < 1, TS > 1
-    assert np.isnan(swept.q[NAN_LATER][late]).all()
-    assert np.isnan(swept.qd[NAN_LATER][late]).all()
-    np.testing.assert_allclose(
-        swept.q[NAN_LATER][early], clean.q[NAN_LATER][early], rtol=1e-8, atol=1e-8
-    )
-    assert np.isnan(swept.q[SPENT][-1]).all()
-    assert np.isfinite(swept.q[SPENT][0]).all()
-
-
-def test_the_others_do_not_notice_and_a_fast_member_is_right(mixed, swept, clean):
+    for found, sound in ((swept.q, clean.q), (swept.qd, clean.qd)):
+        found, sound = found[nan_later], sound[nan_later]
+        assert np.isnan(found[TS > 1]).all()
+        np.testing.assert_allclose(found[TS < 1], sound[TS < 1], rtol=1e-8, atol=1e-8)
     others = np.delete(np.arange(len(clean.q)), [*FAILED, FAST])
-    for a, b in ((swept.q, clean.q), (swept.qd, clean.qd)):
-        np.testing.assert_allclose(a[others], b[others], rtol=1e-9, atol=1e-9)
-    for name in ("num_steps", "num_accepted_steps"):
-        np.testing.assert_array_equal(
-            swept.stats[name][others], clean.stats[name][others]
-        )
-    single, steps = alone(mixed, FAST), swept.stats["num_steps"]
+    np.testing.assert_allclose(swept.q[others], clean.q[others], rtol=1e-9, atol=1e-9)
+    steps, before = swept.stats["num_steps"], clean.stats["num_steps"]
+    np.testing.assert_array_equal(steps[others], before[others])
+    assert steps[spent] == SETTINGS["max_steps"]
     assert steps[FAST] > 2 * steps[others].max()
-    assert steps[FAST] == pytest.approx(single.stats["num_steps"], abs=4)
-    np.testing.assert_allclose(swept.q[FAST], single.q, rtol=1e-6, atol=1e-6)
+    fast = alone(mixed, FAST).q
+    np.testing.assert_allclose(swept.q[FAST], fast, rtol=1e-6, atol=1e-6)
 
 
-# What is kept of members
-
-
-def end_and_fastest(scene, motion):
-    fastest, none = jnp.abs(motion.qd).max(0), motion.q[:0]
-    return {"end": motion.q[-1], "fastest": fastest, "none": none}, motion.result
+def figures_of(scene, motion):
+    total = fj.joint_efforts(scene, motion).total
+    tip = fj.tip_position(scene.linkage, motion.q[-1])
+    start, none = scene.state0.q, motion.q[:0]
+    return {"total": total, "tip": tip, "start": start, "none": none}, motion.result
 
 
 @pytest.mark.slow
-def test_a_reduction_sees_each_motion(mixed, swept):
-    reduced = run(mixed, reduce=end_and_fastest)
-    expected = jax.vmap(lambda motion: end_and_fastest(None, motion))(swept)
+def test_a_reduction_sees_each_member_and_its_motion(mixed, swept):
+    reduced = run(mixed, reduce=figures_of)
+
+    @jax.jit
+    @jax.vmap
+    def expected(linkage, state0, forces, motion):
+        return figures_of(fj.Scene(linkage, state0, forces, TS[-1]), motion)
+
+    expected = expected(*mixed, swept)
     assert_alike(reduced, expected)
     for a, b in zip(*map(jax.tree.leaves, (reduced, expected))):
         np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-8)
-    assert np.isnan(reduced[0]["end"]).any(axis=1).nonzero()[0].tolist() == FAILED
-
-
-@pytest.mark.slow
-def test_a_reduction_sees_each_member():
-    def tip_and_work(scene, motion):
-        total = fj.joint_efforts(scene, motion).total
-        return fj.tip_position(scene.linkage, motion.q[-1]), total, scene.state0.q
-
-    both = two_links()
-    tips, efforts, starts = run(both, reduce=tip_and_work)
-    np.testing.assert_array_equal(starts, both[1].q)
-    for k in range(2):
-        member = jax.tree.map(lambda leaf, k=k: leaf[k], both)
-        single = alone(both, k)
-        tip = fj.tip_position(member[0], single.q[-1])
-        np.testing.assert_allclose(tips[k], tip, atol=1e-7)
-        wanted = fj.joint_efforts(member[0], member[2], single).total
-        np.testing.assert_allclose(efforts[k], wanted, atol=1e-6)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("reduce", [None, end_and_fastest])
-def test_throw_tells_how_many_failed(mixed, reduce):
     with pytest.raises(RuntimeError, match=r"3 of 42 members failed.* member 3\."):
-        run(mixed, reduce=reduce, throw=True)
+        run(mixed, reduce=figures_of, throw=True)
+
+
+def ramp(t, linkage):
+    return jnp.ones(1) * t, jnp.ones(1)
+
+
+@pytest.mark.slow
+def test_arrays_without_the_axis_are_shared():
+    """Shared arrays include starting velocities, here whole numbers, and times."""
+    q, kp = np.random.default_rng(4).uniform(0.5, 1, (2, 3, 1))
+    pd, ts = fj.PDController(9.0, 4.0, 50.0, ramp), TS.copy()
+    # A function among the arrays, such as this reference, has no axis.
+    own = jax.tree.map(lambda a: np.stack([a] * 3) if eqx.is_array(a) else a, pd)
+    forces = DAMPER, eqx.tree_at(lambda pd: pd.kp, own, kp), pd
+    axes = None, 0, None
+    start = fj.State(q, [1])
+    motion = fj.sweep(PENDULUM, start, ts, forces, forces_axes=axes, **SHORT)
+    ts[:] = 0  # the motion keeps its own, once for all members
+    assert motion.ts.strides[0] == 0
+    np.testing.assert_array_equal(motion.ts, np.tile(TS, (3, 1)))
+    for member in range(3):
+        one = DAMPER, pd.replace(kp=kp[member]), pd
+        single = fj.simulate(PENDULUM, fj.State(q[member], [1]), TS, one, **SHORT)
+        np.testing.assert_allclose(motion.q[member], single.q, rtol=1e-8, atol=1e-8)
 
 
 # Under transformations
 
 
-def two_links():
-    return jax.tree.map(lambda leaf: leaf[:2], single_links())
-
-
-@pytest.mark.slow
-def test_it_works_under_transformations(batch):
-    def swept(q, **keywords):
-        linkage, state0, forces = batch
-        return run((linkage, state0._replace(q=q), forces), **keywords)
-
-    end = lambda q: swept(q, reduce=lambda scene, motion: motion.q[-1])
-    assert jax.eval_shape(end, batch[1].q).shape == (42, 3)
-    assert jax.eval_shape(swept, batch[1].q).ts.shape == (42, len(TS))
-
-
-def test_traced_values_may_be_out_of_sight(monkeypatch):
-    """Functions of the user's hold them, or they have nothing to do with the sweep."""
-    sizes = []
-
-    def traced(moving, common, size, chunk):
-        sizes.append(size)
-        return jnp.ones(size)
-
-    monkeypatch.setattr(sys.modules["fdof_jax.batches.sweep"], "_traced", traced)
-
-    def total(w):
-        return w * run(two_links(), reduce=lambda scene, motion: w * motion.q[-1]).sum()
-
-    assert jax.grad(total)(1.0) == 2
-    assert jax.vmap(total)(jnp.ones(3)).tolist() == [2, 2, 2]
-    assert sizes == [2, 2]
-
-
 @pytest.mark.slow
 def test_failed_members_add_nothing_to_a_gradient():
     """Reverse mode adds all members' cotangents to the shared mass; 0 x NaN is NaN."""
-    # Of one link, whose program is the smallest.
-    linkage = chains.random_chain("R", np.random.default_rng(1))
-    rng = np.random.default_rng(2)
-    q, qd = rng.uniform(-1, 1, (2, 4, 1))
+    q, qd = np.random.default_rng(2).uniform(-1, 1, (2, 4, 1))
     q[1, 0] = np.nan
     breaking = (Breaking(jnp.array([1e9, 1e9, TS[1], 1e9])),)
 
-    def with_mass(mass):
-        return eqx.tree_at(lambda k: k.mass, linkage, mass)
-
-    @jax.jit
-    @lambda f: jax.value_and_grad(f, has_aux=True)
-    def distance(mass):
-        solution = fj.sweep(
-            with_mass(mass), fj.State(q, qd), TS[:3], breaking, forces_axes=0, chunk=4,
-            solver=LoopedDopri8(), adjoint=ADJOINT,
+    def distance(mass, factor):
+        arm = eqx.tree_at(lambda arm: arm.mass, PENDULUM, mass)
+        ends = fj.sweep(
+            arm, fj.State(q, qd), TS[:3], breaking, forces_axes=0, chunk=4,
+            adjoint=ADJOINT, **SHORT,
+            # A function may hold a traced value, too.
+            reduce=lambda scene, motion: factor * motion.q[-1, 0],
         )  # fmt: skip
-        counted = solution.result == diffrax.RESULTS.successful
-        end = jnp.where(counted[:, None], solution.q[:, -1], 0)
-        return jnp.sum(end**2), solution
+        return jnp.nansum(ends**2), ends
 
-    (_, solution), gradient = distance(linkage.mass)
-    assert successful(solution).tolist() == [True, False, False, True]
-    assert np.isnan(solution.q[1]).any(axis=-1).all()
-    assert np.isnan(solution.q[2, -1]).all() and np.isfinite(solution.q[2, 0]).all()
+    slope = jax.jit(jax.value_and_grad(distance, (0, 1), has_aux=True), **LOOPS)
+    mass = PENDULUM.mass
+    (value, ends), (of_mass, of_factor) = slope(mass, 1.0)
+    assert np.isnan(ends).tolist() == [False, True, True, False]
 
     def difference(h):
-        ends = [distance(linkage.mass + s * h)[0][0] for s in (1, -1)]
-        return (ends[0] - ends[1]) / 2
+        above, below = (slope(mass + s * h, 1.0)[0][0] for s in (1, -1))
+        return (above - below) / 2
 
     expected = (8 * difference(5e-4) - difference(1e-3)) / 3e-3
     assert np.abs(expected) > 1e-3
-    np.testing.assert_allclose(gradient, expected, rtol=1e-7, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_a_failed_member_adds_nothing_to_a_gradient_in_a_held_value():
-    linkage, state0, forces = jax.tree.map(lambda leaf: leaf[:3], single_links())
-    state0.q[1] = np.nan
-
-    def total(w):
-        reduce = lambda scene, motion: w * motion.q[-1]
-        return jnp.nansum(run((linkage, state0, forces), reduce=reduce))
-
-    np.testing.assert_allclose(jax.grad(total)(1.0), total(1.0), rtol=1e-6)
-
-
-@pytest.mark.slow
-def test_a_gradient_is_compiled_once():
-    linkage, state0, forces = two_links()
-    traces = []
-
-    def end(scene, motion):
-        traces.append(motion)
-        return motion.q[-1]
-
-    def ends(q):
-        moved = linkage, state0._replace(q=q), forces
-        return run(moved, reduce=end).sum()
-
-    first = jax.grad(ends)(state0.q)
-    assert traces
-    traces.clear()
-    second = jax.grad(ends)(state0.q)
-    assert not traces
-    np.testing.assert_array_equal(first, second)
-
-
-# Shared arrays
-
-
-def ramp(t, linkage):
-    return jnp.ones(3) * t, jnp.ones(3)
-
-
-def test_a_motion_keeps_its_times_when_their_array_changes(batch):
-    ts = TS.copy()
-    motion = fj.sweep(*batch[:2], ts, batch[2], forces_axes=0, chunk=CHUNK, **SETTINGS)
-    ts[:] = 0
-    np.testing.assert_array_equal(motion.ts[0], TS)
-
-
-@pytest.mark.slow
-def test_arrays_without_the_axis_are_shared():
-    """Shared arrays include starting velocities, here whole numbers."""
-    linkage = random_linkage("RPR", np.random.default_rng(3))
-    rng = np.random.default_rng(4)
-    starts = rng.uniform(-1, 1, (3, 3))
-    damper, shared = fj.JointDamper(1.3), fj.PDController(9.0, 4.0, 50.0, ramp)
-    own = [fj.PDController(kp, 4.0, 50.0, ramp) for kp in rng.uniform(0.5, 40, 3)]
-    # A function among the arrays, such as this reference, has no axis.
-    stacked = jax.tree.map(lambda *a: np.stack(a) if eqx.is_array(a[0]) else a[0], *own)
-    solution = fj.sweep(
-        linkage,
-        fj.State(starts, [0, 0, 1]),
-        TS,
-        (damper, stacked, shared),
-        forces_axes=(None, 0, None),
-        **SHORT,
-    )
-    assert solution.q.shape == (3, len(TS), 3)
-    for member, q in enumerate(starts):
-        start, forces = fj.State(q, [0, 0, 1]), (damper, own[member], shared)
-        single = fj.simulate(linkage, start, TS, forces, **SHORT)
-        np.testing.assert_allclose(solution.q[member], single.q, rtol=1e-8, atol=1e-8)
-
-
-@pytest.mark.slow
-def test_an_implicit_solver_finds_its_tolerances():
-    linkage = chains.random_chain("R", np.random.default_rng(1))
-    start = fj.State(np.array([[0.0], [0.1]]), np.zeros(1))
-    steps = diffrax.PIDController(rtol=1e-8, atol=1e-8)
-    solution = fj.sweep(
-        linkage, start, [0, 0.2], solver=diffrax.Kvaerno5(), stepsize_controller=steps
-    )
-    alone = fj.simulate(linkage, fj.State(start.q[1], start.qd), [0, 0.2])
-    np.testing.assert_allclose(solution.q[1], alone.q, atol=1e-6)
-
-
-def test_no_members():
-    """`vmap` over no members has nothing to raise."""
-    linkage, state0, *_ = fj.scenes.fig5()
-    motion = lambda q: fj.simulate(linkage, state0._replace(q=q), TS)
-    solution = jax.eval_shape(jax.vmap(motion), np.zeros((0, 3)))
-    assert solution.q.shape == (0, len(TS), 3)
-
-
-@pytest.fixture
-def guarded():
-    """Lets no array reach or leave JAX unasked, in any thread."""
-    before = jax.config.jax_transfer_guard
-    jax.config.update("jax_transfer_guard", "disallow")
-    yield
-    jax.config.update("jax_transfer_guard", before)
-
-
-def test_under_a_transfer_guard(batch, guarded, monkeypatch):
-    linkage, state0, *_ = fj.scenes.fig5()
-    monkeypatch.setattr(devices, "cores", lambda: 2)
-    solution = run(batch)
-    motion = fj.simulate(linkage, state0, TS)
-    with jax.transfer_guard("allow"):
-        assert successful(solution).all() and successful(motion)
+    np.testing.assert_allclose(of_mass, [expected], rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(of_factor, 2 * value, rtol=1e-12)
 
 
 def test_what_a_transformation_cannot_do_is_refused(batch, tmp_path):
@@ -338,9 +219,216 @@ def test_what_a_transformation_cannot_do_is_refused(batch, tmp_path):
             jax.eval_shape(functools.partial(end, **options), state0.q)
 
 
-def test_what_members_share_is_checked():
-    """Warnings are errors in these tests, so that nothing is solved."""
-    stops = fj.forces.JointStops([-1, -1, -1], [1, 1, 90])
-    states = fj.State(np.zeros((2, 3)), np.zeros((2, 3)))
-    with pytest.raises(UserWarning, match=r"^forces\[0\]\.upper: .* radians, got 90"):
-        fj.sweep(fj.scenes.fig5().linkage, states, TS, (stops,))
+def test_under_a_transfer_guard(batch, monkeypatch):
+    """No array may reach or leave JAX unasked, in any thread."""
+    monkeypatch.setattr(devices, "cores", lambda: 2)
+    with setting("jax_transfer_guard", "disallow"):
+        motions, motion = run(batch), fj.simulate(PENDULUM, ([0.0], [0.0]), TS)
+    assert (motions.outcome == "successful").all() and motion.outcome == "successful"
+
+
+# Chunks
+
+
+@pytest.mark.slow
+def test_small_batches_share_a_program_and_need_no_forecast(solved, monkeypatch):
+    monkeypatch.setattr(chunks, "expected_work", None)
+    speeds = np.linspace(0, 1, 8)
+    first = sweep_of(speeds)
+    before = devices.compiled.cache_info().misses
+    for size in (2, 5, 7):
+        assert sweep_of(speeds[:size]).q.shape == (size, len(TS), 1)
+    assert devices.compiled.cache_info().misses == before
+    assert [len(q) for q, _ in solved] == [8] * 4
+    # It has the equations of one joint: its existence factors are not given to it.
+    arm, starts = pendulums(speeds)
+    arms = eqx.tree_at(lambda arm: arm.ef, arm, np.tile(arm.ef, (8, 1)))
+    any_kind = fj.sweep(arms, starts, TS, **SETTINGS)
+    np.testing.assert_allclose(first.q, any_kind.q, atol=1e-12)
+    assert [len(moving) for moving in solved] == [2] * 4 + [3]
+
+
+@pytest.mark.slow
+def test_members_are_sorted_by_a_forecast_that_serves_all_sizes(
+    solved, traces, monkeypatch
+):
+    monkeypatch.setattr(devices, "cores", lambda: 1)
+    speeds = 3 * np.array([0.0, 9, 1, 8, 2, 7, 3, 6, 4, 5, 10, 11])
+    motion = sweep_of(speeds, chunk=4)
+    np.testing.assert_array_equal(motion.qd[:, 0, 0], speeds)
+    found = [sorted(qd[:, 0] / 3) for _, qd in solved]
+    assert found == [[8, 9, 10, 11], [4, 5, 6, 7], [0, 1, 2, 3]]
+    before = len(traces)
+    sweep_of(np.linspace(0, 1, 40), chunk=4)
+    assert len(traces) == before > 0
+    # Starts of any type are solved in double precision, by the same program.
+    arm, starts = pendulums(speeds)
+    for kinds in ((np.float32, np.float32), (np.float32, float), (float, int)):
+        starts = fj.State(*(a.astype(kind) for a, kind in zip(starts, kinds)))
+        again = fj.sweep(arm, starts, TS, chunk=4, **SETTINGS)
+        assert_alike(again, motion)
+        np.testing.assert_array_equal(again.q, motion.q)
+    assert len(traces) == before
+
+
+@pytest.mark.slow
+def test_a_slow_member_is_stopped_and_solved_alone(solved):
+    speeds = np.linspace(0, 1, LANES)
+    speeds[20] = 60
+    motion = sweep_of(speeds)
+    assert [len(q) for q, _ in solved] == [LANES, 1]
+    np.testing.assert_array_equal(solved[1][1], [[60]])
+    assert (motion.outcome == "successful").all()
+    steps = np.asarray(motion.stats["num_steps"])
+    assert steps[20] > 3 * np.delete(steps, 20).max()
+    arm, (q, qd) = pendulums(speeds)
+    for member in (20, 21):
+        single = fj.simulate(arm, fj.State(q[member], qd[member]), TS, **SETTINGS)
+        np.testing.assert_allclose(motion.q[member], single.q, rtol=1e-6, atol=1e-6)
+
+
+class Recorder(diffrax.NoProgressMeter):
+    seen: list
+
+    def step(self, state, progress):
+        self.seen.append(float(progress))
+        return state
+
+
+def test_progress_rises_to_one_and_other_values_need_no_new_trace(mixed, swept, traces):
+    recorder = Recorder([])
+    linkage, (q, qd), forces = mixed
+    other = run((linkage, fj.State(q + 0.1, qd), forces), progress_meter=recorder)
+    assert not np.array_equal(other.q[1], swept.q[1])
+    assert 0 <= recorder.seen[0] < 1 and recorder.seen[-1] == 1
+    assert len(recorder.seen) >= len(q) // CHUNK and (np.diff(recorder.seen) >= 0).all()
+    run(jax.tree.map(lambda a: a[:11], mixed))  # nor do fewer members
+    assert not traces
+
+
+# Cores, devices and precision
+
+
+@pytest.mark.slow
+def test_cores_change_nothing(batch, clean, monkeypatch):
+    """Chunks are the same ones, whatever the number of threads that send them."""
+    for cores in (1, 3):
+        monkeypatch.setattr(devices, "cores", lambda cores=cores: cores)
+        motion = run(batch)
+        for a, b in zip(*map(jax.tree.leaves, (motion, clean))):
+            np.testing.assert_array_equal(a, b)
+
+
+class Mixed(fj.Element):
+    """A damper whose numbers are of any type."""
+
+    coefficient: Any
+    doubled: Any
+
+    def __call__(self, t, q, qd, linkage):
+        return -self.coefficient * (1 + self.doubled) * qd
+
+
+@pytest.mark.slow
+def test_threads_compute_in_the_precision_that_is_asked_for(monkeypatch):
+    """Numbers are NumPy's, of which some differ between members."""
+    monkeypatch.setattr(devices, "cores", lambda: 2)
+    arm, starts = pendulums(np.linspace(0, 1, 40))
+    mixed = Mixed(np.repeat([0.5, 1.0], 20), np.int64(1))
+    solve = functools.partial(fj.sweep, arm, starts, TS, chunk=20, **SHORT)
+    with setting("jax_enable_x64", False):
+        single = solve((mixed,), forces_axes=(Mixed(0, None),))
+        with jax.enable_x64(True):
+            double = solve((fj.JointDamper(2.0),))
+    assert (single.q.dtype, double.q.dtype) == (np.float32, np.float64)
+    np.testing.assert_allclose(single.q[20:], double.q[20:], atol=1e-4)
+
+
+@pytest.mark.slow
+def test_cores_take_copies_of_a_program_unless_it_calls_python(monkeypatch):
+    monkeypatch.setattr(devices, "cores", lambda: 2)
+    kind = jax.ShapeDtypeStruct((1,), float)
+    call = lambda qd: jax.pure_callback(
+        np.negative, kind, qd, vmap_method="expand_dims"
+    )
+    drag = lambda t, q, qd, linkage: call(qd)
+    solve = functools.partial(fj.sweep, *pendulums(np.linspace(0, 1, 40)), TS)
+    misses, motions = [devices.compiled.cache_info().misses], []
+    # Those of a folder of programs cannot be copied.
+    with setting("jax_compilation_cache_dir", None):
+        compilation_cache.reset_cache()
+        for element in drag, DAMPER:
+            motions.append(solve((element,), chunk=20, **SHORT).q)
+            misses.append(devices.compiled.cache_info().misses)
+    compilation_cache.reset_cache()
+    assert np.diff(misses).tolist() == [3, 2]  # the forecast is of one chunk
+    np.testing.assert_allclose(*motions, atol=1e-12)
+
+
+def test_an_option_that_xla_does_not_know_is_left_out(monkeypatch):
+    monkeypatch.setattr(configuration, "_WIDE", {"xla_cpu_no_such_option": 1})
+    assert configuration.wide_vectors.__wrapped__() == {}
+
+
+WORKER = """
+import sys
+import jax
+import numpy as np
+import fdof_jax as fj
+fj.configure(x64=True)
+address, index, folder = sys.argv[1:]
+jax.distributed.initialize(address, 2, int(index))
+import sweep_batch
+from elements import SHORT
+assert (jax.device_count(), jax.local_device_count()) == (4, 2)
+batch = sweep_batch.members()
+options = SHORT | dict(chunk=4)
+motion = sweep_batch.run(batch, **options)
+sweep_batch.run(batch, store=folder + "/store", shard=int(index), of=2, **options)
+if hasattr(jax, "set_mesh"):
+    lanes = jax.sharding.PartitionSpec("lanes")
+    mesh = jax.sharding.Mesh(jax.local_devices(), ("lanes",))
+    spread = jax.device_put(batch, jax.sharding.NamedSharding(mesh, lanes))
+    with jax.set_mesh(mesh):
+        same = sweep_batch.run(spread, **options)
+    np.testing.assert_array_equal(same.q, motion.q)
+np.savez(f"{folder}/{index}.npz", q=motion.q, qd=motion.qd)
+"""
+
+
+@pytest.mark.slow
+def test_more_devices_and_processes_change_nothing(batch, tmp_path):
+    """Uses two devices in each of two processes, and inputs spread over them."""
+    with socket.socket() as port:
+        port.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{port.getsockname()[1]}"
+    here = Path(__file__).parent
+    environment = os.environ | dict(
+        JAX_PLATFORMS="cpu",
+        JAX_NUM_CPU_DEVICES="2",
+        PYTHONPATH=os.pathsep.join([str(here), str(here.parent)]),
+    )
+    workers = [
+        subprocess.Popen(
+            [sys.executable, "-c", WORKER, address, str(index), str(tmp_path)],
+            env=environment,
+            stderr=subprocess.PIPE,
+        )
+        for index in range(2)
+    ]
+    try:
+        for worker in workers:
+            _, errors = worker.communicate(timeout=600)
+            assert worker.returncode == 0, errors.decode()[-3000:]
+    finally:
+        for worker in workers:
+            worker.kill()
+    expected = run(batch, **SHORT)
+    close = functools.partial(np.testing.assert_allclose, rtol=1e-12, atol=1e-12)
+    for index in range(2):
+        answer = np.load(tmp_path / f"{index}.npz")
+        close(answer["q"], expected.q)
+        close(answer["qd"], expected.qd)
+    with xarray.open_zarr(tmp_path / "store") as data:
+        assert not data.failed.any()
+        close(data.q, expected.q)

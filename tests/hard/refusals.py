@@ -12,21 +12,11 @@ from .fuzz_report import Failure
 def linkage_of(arm: oracle.Arm) -> fj.Linkage | None:
     """Returns the library's linkage, or None if it rejects the arm as singular."""
     try:
-        linkage = fj.Linkage(
-            arm.topology,
-            length=arm.length,
-            com=arm.com,
-            mass=arm.mass,
-            inertia=arm.inertia,
-            locked=arm.locked,
-            base_angle=arm.base_angle,
-            gravity=arm.gravity,
-        )
+        return fj.Linkage(**arm._asdict())
     except ValueError as error:
         if not str(error).startswith("mass, inertia, com: expected joint"):
             raise Failure(f"refused for another reason: {error}") from error
         return None
-    return linkage
 
 
 def never_determined(arm: oracle.Arm) -> str | None:
@@ -36,14 +26,9 @@ def never_determined(arm: oracle.Arm) -> str | None:
     """
     rng = random.Random(0)
     reach = sum(map(abs, arm.length)) + sum(abs(c) for pair in arm.com for c in pair)
-    found = []
-    for _ in range(6):
-        q = [
-            rng.uniform(-3, 3) if j == "R" else rng.uniform(-1, 1) * (reach or 1)
-            for j in arm.topology
-        ]
-        a = oracle.acceleration(arm, q, (0.0,) * 3, (0.0,) * 3)
-        found.append(a)
+    limits = [3 if joint == "R" else reach or 1 for joint in arm.topology]
+    draw = lambda: [rng.uniform(-limit, limit) for limit in limits]
+    found = [oracle.acceleration(arm, draw(), (0.0,) * 3, (0.0,) * 3) for _ in range(6)]
     if all(a.qdd is None for a in found):
         return "refused: always singular"
     if all(a.qdd is None or _scaled_inverse(a) > 1e13 for a in found):
