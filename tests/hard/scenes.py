@@ -18,7 +18,7 @@ from helpers import Hold as Hold
 
 import fdof_jax as fj
 
-# Made by make_reference.py and make_driven_reference.py.
+# Made by make_reference.py and make_driven_reference.py of benchmarks/
 REFERENCE, DRIVEN = (
     json.loads((Path(__file__).parent / name).read_text())
     for name in ("reference.json", "driven_reference.json")
