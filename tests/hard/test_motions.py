@@ -91,10 +91,8 @@ def test_another_solver_is_as_exact_and_is_stopped_too():
     # Accelerations that are no number, which diffrax itself would reject for ever.
     burst = scene._replace(forces=(fj.JointEffort(np.full(3, 1e308)), scene.forces[1]))
     for scene, outcome in ((heavy, "ill-conditioned"), (burst, "not finite")):
-        for motion in (
-            hard.simulate(scene, **by_another),
-            hard.simulate(scene, throw=False),
-        ):
+        for options in (by_another, dict(throw=False)):
+            motion = hard.simulate(scene, **options)
             assert motion.outcome == outcome
             assert motion.stats["num_steps"] < 200
 
@@ -110,29 +108,26 @@ def test_running_out_of_steps_is_told():
     np.testing.assert_array_equal(finite, scene.ts <= reached)
     whole = hard.simulate(scene)
     np.testing.assert_allclose(short.q[finite], whole.q[finite], atol=1e-8)
-    with pytest.raises(RuntimeError, match="max_steps"):
-        hard.simulate(scene, max_steps=50)
 
 
 # Chaos makes errors grow by 2.4e4 as derivatives do, so that much of a tolerance of
 # 1e-11 is left undetermined.
-@pytest.mark.parametrize("scene, tolerance, argument, bound", [
-    ("fig5", 1e-11, "q0", 1e-11 * 2.4e4),
-    ("fig5", 1e-11, "mass", 1e-5),
-    ("fig5", 1e-11, "length", 1e-5),
-    ("driven-through-0-RPR", 1e-11, "q0", 1e-6),
-    ("at rest", 1e-8, "q0", 1e-6),
+@pytest.mark.parametrize("name, argument, bound", [
+    ("fig5", "q0", 1e-11 * 2.4e4),
+    ("fig5", "mass", 1e-5),
+    ("fig5", "length", 1e-5),
+    ("driven-through-0-RPR", "q0", 1e-6),
 ])  # fmt: skip
-def test_derivatives_equal_the_reference(scene, tolerance, argument, bound):
-    at_rest = scene == "at rest"
-    exact = (
-        hard.linear_motion(10.0)
-        if at_rest
-        else hard.REFERENCE[scene][f"dq_d{argument}"]
-    )
-    found = hard.slopes(REST if at_rest else hard.load(scene), tolerance)
-    slope = dict(zip(("q0", "mass", "length"), found))[argument]
-    assert hard.largest_error(slope, exact) <= bound
+def test_derivatives_equal_the_reference(name, argument, bound):
+    found = dict(zip(("q0", "mass", "length"), hard.slopes(hard.load(name))))
+    exact = hard.REFERENCE[name][f"dq_d{argument}"]
+    assert hard.largest_error(found[argument], exact) <= bound
+
+
+def test_derivatives_at_rest():
+    """Not even a loose tolerance passes over an oscillation that does not move."""
+    found, *_ = hard.slopes(REST, tolerance=1e-8)
+    assert hard.largest_error(found, hard.linear_motion(10.0)) <= 1e-6
 
 
 def test_derivatives_of_a_heavy_tip():
