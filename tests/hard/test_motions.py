@@ -68,6 +68,14 @@ def test_motions_equal_the_reference(name):
         assert laws["lost"] < motion.stats["accuracy"] < 30 * laws["lost"]
 
 
+def test_rounding_does_not_shorten_steps():
+    """With a tip of a million tonnes it determines the error that is estimated."""
+    scene = hard.load("heavy-tip-1e9")
+    motion = hard.simulate(scene, hard.DEFAULT, rtol=1e-13, atol=1e-13)
+    assert hard.error(motion, scene) <= 1e-3
+    assert motion.stats["num_steps"] < 10_000
+
+
 def test_energy_of_chaos_to_60_s():
     """The states are wrong after 25 s, but their energy is not."""
     scene = hard.fig5(np.linspace(0, 60, 21))
