@@ -26,14 +26,14 @@ SOLVED, _, BY_NAME, SILENTLY = OUTCOMES
 
 # By number of the scene: its name, and the tests of it.
 TESTS = {
-    18: ("chattering at a limit", "test_stiff_control.py", "chattering"),
-    19: ("derivatives at a limit", "test_saturation.py", ""),
+    18: ("chattering at a limit", "test_driven.py", "chattering"),
+    19: ("derivatives at a limit", "test_driven.py", "saturation or the_limit"),
     23: ("float32", "test_single_precision.py", ""),
-    24: ("jumps, a pulse of 1 us", "test_jumps.py", ""),
-    25: ("odd members of a batch", "test_bad_members.py", "members"),
-    26: ("out of steps", "test_bad_members.py", "steps or reached"),
-    27: ("junk in unused values", "test_unused_values.py", ""),
-    28: ("losses at zero error", "test_derivatives.py", "zero or radius"),
+    24: ("jumps, a pulse of 1 us", "test_driven.py", "reference or pulse"),
+    25: ("odd members of a batch", "test_batches.py", ""),
+    26: ("out of steps", "test_motions.py", "out_of_steps"),
+    27: ("junk in unused values", "test_traced.py", "use or fictitious"),
+    28: ("losses at zero error", "test_traced.py", "everything"),
     29: ("Hessians of a batch", "../test_switches.py", "hessians"),
     30: ("malformed input", "test_malformed.py", ""),
 }

@@ -60,8 +60,6 @@ LONG_EXAMPLES = {
 # many of them, which take most of their time.
 LARGE, MOST_LARGE = 60_000, 100
 BEGIN = time.time()
-# Scripts that need packages which the tests do not need.
-collect_ignore_glob = ["hard/make_*.py"]
 
 
 # Sweeps that several files test.

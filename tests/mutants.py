@@ -203,7 +203,7 @@ MUTANTS = {
         "steps/judge.py",
         "is_noise = error_size < _NOISE * rounding",
         "is_noise = error_size < 0 * rounding",
-        "tests/hard/test_ill_conditioned.py::test_a_tip_of_a_million_tonnes",
+        "tests/hard/test_motions.py::test_rounding_does_not_shorten_steps",
     ),
     # Methods
     "compensation off": Mutant(
@@ -329,6 +329,49 @@ MUTANTS = {
         "q, qd = (value + rows[k] for value, rows in zip((q, qd), self.noise))",
         "pass",
         f"{SAMPLED}::test_noise_is_what_the_key_says",
+    ),
+    # Arithmetic, arms, the paper's equations, tables
+    "bearings turn the wrong way": Mutant(
+        "base/trigonometry.py",
+        "along * y_dot - across * x_dot",
+        "along * y_dot + across * x_dot",
+        "tests/test_trigonometry.py::test_derivatives_of_angles",
+    ),
+    "slides half a turn apart are not parallel": Mutant(
+        "linkage/singularity.py",
+        "abs(np.sin(locked[body].sum()))",
+        "abs(locked[body].sum())",
+        "tests/test_singularity.py::test_what_is_said_of_an_arm",
+    ),
+    "pivots alone tell the loss of digits": Mutant(
+        "mechanics/solve.py",
+        "own = functools.reduce(add, terms, inverse[k])",
+        "own = inverse[k]",
+        "tests/test_chain_rounding.py::test_health_states_the_loss_of_digits",
+    ),
+    "half of Coriolis' torque of the last slide": Mutant(
+        "paper.py",
+        "- m4 * (2 * B3 * v3 * w3 + g * (A3 * c3 - B3 * s3))",
+        "- m4 * (B3 * v3 * w3 + g * (A3 * c3 - B3 * s3))",
+        "tests/test_reference.py::test_an_instant[RRP-full]",
+    ),
+    "efforts of fictitious joints count": Mutant(
+        "paper.py",
+        "effort = jnp.where(real, force, 0)",
+        "effort = force",
+        "tests/hard/test_traced.py::test_efforts_of_fictitious_joints[RPR]",
+    ),
+    "rates have the units of positions": Mutant(
+        "data/tables.py",
+        "(solution.qd, rate_unit)",
+        "(solution.qd, str)",
+        "tests/test_tables.py::test_a_motion_has_named_joints_with_units",
+    ),
+    "what creeps from below has settled": Mutant(
+        "tuning/within_limits.py",
+        "jnp.abs(share_now - 1) - _BAND",
+        "share_now - 1 - _BAND",
+        "tests/test_limits.py::test_limits_out_of_reach_are_exceeded_least",
     ),
     # Drives, controllers and tuning
     "fixed pairs of a model accelerate": Mutant(

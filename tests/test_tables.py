@@ -29,8 +29,8 @@ def solution(*batch, failed=()) -> fj.Solution:
     for _ in batch:
         chosen = jax.vmap(chosen)
     stats = {"num_steps": np.full(batch, 7), "time_reached": np.where(good, 2.0, 0.1)}
-    ts = jnp.broadcast_to(TS, (*batch, len(TS)))
-    return fj.Solution(ts, jnp.asarray(q[0]), jnp.asarray(q[1]), stats, chosen(good))
+    ts, (q, qd) = jnp.broadcast_to(TS, (*batch, len(TS))), map(jnp.asarray, q)
+    return fj.Solution(ts, q, qd, stats, chosen(good))
 
 
 def test_a_motion_has_named_joints_with_units():
@@ -45,6 +45,15 @@ def test_a_motion_has_named_joints_with_units():
     np.testing.assert_array_equal(found.qd.sel(time=1.0), motion.qd[2])
     assert (found.outcome, found.num_steps) == ("successful", 7)
     assert fj.to_xarray(make_linkage("RRR"), motion).qd.units == "rad/s"
+    table = fj.to_pandas(arm, motion)
+    units = dict(zip(("R1", "P2", "R3"), ("rad", "m", "rad")))
+    positions = [f"{name} [{unit}]" for name, unit in units.items()]
+    velocities = [f"{name} [{unit}/s]" for name, unit in units.items()]
+    assert list(table) == [*positions, *velocities, "outcome"]
+    assert table.index.name == "time [s]" and table.index.tolist() == TS.tolist()
+    np.testing.assert_array_equal(table[positions], motion.q)
+    np.testing.assert_array_equal(table[velocities], motion.qd)
+    assert set(table.outcome) == {"successful"}
 
 
 @pytest.mark.slow
@@ -63,21 +72,29 @@ def test_held_joints_are_told_alike_in_memory_and_in_a_store(tmp_path):
     words = data.modes.flag_meanings.split()
     assert words == ["free", "friction", "lower_stop", "upper_stop", "brake"]
     assert data.modes[:, -1, 0].values.tolist() == [0, words.index("friction")]
+    held = fj.to_pandas(arm, motions)["R1 held by"]
+    assert held[:, TS[-1]].tolist() == ["free", "friction"]
 
 
 def test_a_batch_has_axes_and_says_what_failed():
-    motion = solution(4, failed=[2])
-    found = fj.to_xarray(make_linkage("RRP"), motion)
+    arm, motion = make_linkage("RRP"), solution(4, failed=[2])
+    found = fj.to_xarray(arm, motion)
     assert found.q.dims == ("batch", "time", "joint")
     np.testing.assert_array_equal(found.q, motion.q)
     good = ["successful", "successful", "ill-conditioned", "successful"]
     assert found.outcome.values.tolist() == good
     assert found.time_reached.values.tolist() == [2, 2, 0.1, 2]
-    named = found.rename(batch="payload").assign_coords(payload=[0, 1, 2, 3])
-    assert named.outcome.sel(payload=2) == "ill-conditioned"
-    two = fj.to_xarray(make_linkage("RRP"), solution(4, 2))
-    assert two.q.dims == ("batch_1", "batch_2", "time", "joint")
-    assert two.outcome.dims == ("batch_1", "batch_2")
+    assert fj.to_pandas(arm, motion).index.names == ["batch", "time [s]"]
+    motion = solution(3, 2, failed=[(1, 0)])
+    found, table = fj.to_xarray(arm, motion), fj.to_pandas(arm, motion)
+    assert found.q.dims == ("batch_1", "batch_2", "time", "joint")
+    assert found.outcome.dims == ("batch_1", "batch_2")
+    assert table.index.names == ["batch_1", "batch_2", "time [s]"]
+    row = table.loc[2, 1, TS[3]]
+    assert row["P3 [m]"] == motion.q[2, 1, 3, 2]
+    assert row["R1 [rad/s]"] == motion.qd[2, 1, 3, 0]
+    failed = table[table.outcome != "successful"]
+    assert set(failed.index.droplevel("time [s]")) == {(1, 0)}
 
 
 def test_joints_of_two_kinds_are_numbers():
@@ -88,43 +105,13 @@ def test_joints_of_two_kinds_are_numbers():
     assert "2 [m/s or rad/s]" in fj.to_pandas(arms, solution(2))
 
 
-def test_a_table_of_a_motion():
-    motion = solution()
-    found = fj.to_pandas(make_linkage("PRR"), motion)
-    assert list(found) == [
-        "P1 [m]", "R2 [rad]", "R3 [rad]", "P1 [m/s]", "R2 [rad/s]", "R3 [rad/s]",
-        "outcome",
-    ]  # fmt: skip
-    assert found.index.name == "time [s]" and found.index.tolist() == TS.tolist()
-    np.testing.assert_array_equal(found["R2 [rad]"], motion.q[:, 1])
-    np.testing.assert_array_equal(found["P1 [m/s]"], motion.qd[:, 0])
-    assert set(found.outcome) == {"successful"}
-
-
-def test_a_table_of_a_batch():
-    motion = solution(3, 2, failed=[(1, 0)])
-    found = fj.to_pandas(make_linkage("PRR"), motion)
-    assert found.index.names == ["batch_1", "batch_2", "time [s]"]
-    row = found.loc[2, 1, TS[3]]
-    assert row["R3 [rad]"] == motion.q[2, 1, 3, 2]
-    assert row["P1 [m/s]"] == motion.qd[2, 1, 3, 0]
-    failed = found[found.outcome != "successful"]
-    assert set(failed.index.droplevel("time [s]")) == {(1, 0)}
-    one = fj.to_pandas(make_linkage("PRR"), solution(2))
-    assert one.index.names == ["batch", "time [s]"]
-
-
 def test_names_of_joints_of_any_number():
-    for topology in ("R", "RP", "RFPRR"):
-        n = len(topology)
-        arm = random_chain(topology, np.random.default_rng(n))
-        motion = solution()
-        rows = [np.ones((5, n))] * 2
-        motion = fj.Solution(motion.ts, *rows, motion.stats, motion.result)
-        names = [f"{kind}{k + 1}" for k, kind in enumerate(topology)]
-        columns = list(fj.to_pandas(arm, motion).columns)
-        assert [column.split()[0] for column in columns[:n]] == names
-        assert fj.to_xarray(arm, motion).joint.values.tolist() == names
+    arm, motion = random_chain("RFPRR", np.random.default_rng(5)), solution()
+    five = fj.Solution(motion.ts, *[np.ones((5, 5))] * 2, motion.stats, motion.result)
+    names = ["R1", "F2", "P3", "R4", "R5"]
+    assert fj.to_xarray(arm, five).joint.values.tolist() == names
+    columns = list(fj.to_pandas(arm, five).columns)
+    assert [column.split()[0] for column in columns[:5]] == names
 
 
 @pytest.mark.parametrize("name", ["xarray", "pandas"])

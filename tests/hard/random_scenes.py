@@ -1,7 +1,7 @@
 """Hypothesis strategies: random arms of all topologies, their states and efforts."""
 
-import dataclasses
 import math
+from typing import NamedTuple
 
 import hypothesis.strategies as st
 
@@ -20,6 +20,10 @@ def signed(low: float, high: float) -> st.SearchStrategy:
     return st.one_of(st.sampled_from([0.0, 1.0]), size, size.map(lambda v: -v))
 
 
+def or_zero(values: st.SearchStrategy) -> st.SearchStrategy:
+    return st.one_of(st.just((0.0,) * 3), TRIPLE(values))
+
+
 # Near and at the angles where directions align, and after many turns.
 ANGLES = st.one_of(
     st.sampled_from([0.0, math.pi / 2, math.pi, -math.pi / 2]),
@@ -31,49 +35,46 @@ ANGLES = st.one_of(
 )
 TRIPLE = lambda values: st.tuples(values, values, values)
 LENGTHS = signed(1e-3, 1e2)
+INERTIAS = TRIPLE(st.one_of(st.sampled_from([1.0, 0.0]), sized(1e-6, 1e6)))
 
 
-@st.composite
-def arms(draw) -> oracle.Arm:
-    topology = draw(st.sampled_from(fj.TOPOLOGIES))
-    return oracle.Arm(
-        topology,
-        length=draw(st.tuples(*[LENGTHS] * 4)),
-        com=draw(TRIPLE(st.tuples(LENGTHS, LENGTHS))),
-        mass=draw(TRIPLE(st.one_of(st.sampled_from([1.0, 0.0]), sized(1e-6, 1e6)))),
-        inertia=draw(TRIPLE(st.one_of(st.sampled_from([1.0, 0.0]), sized(1e-6, 1e6)))),
-        locked=tuple(draw(LENGTHS if j == "R" else ANGLES) for j in topology),
-        base_angle=draw(ANGLES),
-        gravity=draw(st.one_of(st.sampled_from([9.81, 0.0]), signed(1e-3, 1e3))),
-    )
+class Scene(NamedTuple):
+    """An arm, its start and efforts.
 
+    - `junk`: effort on fictitious joints, which must not matter.
+    - `pace`: about how far the fastest joint moves [m or rad].
+    """
 
-@dataclasses.dataclass(frozen=True)
-class Scene:
     arm: oracle.Arm
     q: tuple
-    qd: tuple
-    tau: tuple
-    junk: float  # effort on fictitious joints, which must not matter
-    damping: tuple
-    pace: float  # about how far the fastest joint moves [m or rad]
-    t0: float
+    qd: tuple = (0.0, 0.0, 0.0)
+    tau: tuple = (0.0, 0.0, 0.0)
+    junk: float = 0.0
+    damping: tuple = (0.0, 0.0, 0.0)
+    pace: float = 1.0
+    t0: float = 0.0
 
 
 @st.composite
 def scenes(draw) -> Scene:
-    arm = draw(arms())
+    topology = draw(st.sampled_from(fj.TOPOLOGIES))
+    arm = oracle.Arm(
+        topology,
+        length=draw(st.tuples(*[LENGTHS] * 4)),
+        com=draw(TRIPLE(st.tuples(LENGTHS, LENGTHS))),
+        mass=draw(INERTIAS),
+        inertia=draw(INERTIAS),
+        locked=tuple(draw(LENGTHS if j == "R" else ANGLES) for j in topology),
+        base_angle=draw(ANGLES),
+        gravity=draw(st.one_of(st.sampled_from([9.81, 0.0]), signed(1e-3, 1e3))),
+    )
     return Scene(
         arm,
-        q=tuple(draw(ANGLES if j == "R" else LENGTHS) for j in arm.topology),
-        qd=draw(st.one_of(st.just((0.0,) * 3), TRIPLE(signed(1e-3, 1e4)))),
-        tau=draw(st.one_of(st.just((0.0,) * 3), TRIPLE(signed(1e-3, 1e6)))),
+        q=tuple(draw(ANGLES if j == "R" else LENGTHS) for j in topology),
+        qd=draw(or_zero(signed(1e-3, 1e4))),
+        tau=draw(or_zero(signed(1e-3, 1e6))),
         junk=draw(signed(1, 1e6)),
-        damping=draw(
-            st.one_of(
-                st.just((0.0,) * 3), TRIPLE(st.one_of(st.just(0.0), sized(1e-3, 1e3)))
-            )
-        ),
+        damping=draw(or_zero(st.one_of(st.just(0.0), sized(1e-3, 1e3)))),
         pace=draw(sized(1e-2, 30)),
         t0=draw(st.sampled_from([0.0, -3.0, 100.0])),
     )

@@ -1,8 +1,8 @@
-"""Makes driven_reference.json: motions under control, and extreme motions.
+"""Makes tests/hard/driven_reference.json: motions under control, and extreme ones.
 
 Needs heyoka and SciPy (the extra `benchmark`) and some minutes on one core:
 
-    python tests/hard/make_driven_reference.py
+    python -m benchmarks.make_driven_reference
 
 The equations are those of `make_reference`, with efforts that depend on the state
 instead of constant ones. Controlled motions are integrated by Taylor series in 80-bit
@@ -13,12 +13,12 @@ of 1e-12.
 
 import json
 from functools import cache
-from pathlib import Path
 
 import heyoka as hy
 import numpy as np
-from make_reference import PARAMETERS, PATH, lagrange, motion
 from scipy.integrate import solve_ivp
+
+from .make_reference import PARAMETERS, PATH, as_text, lagrange, motion
 
 # Links of 1 m and 1 kg: those of the heavy tips with another tip.
 USUAL = json.loads(PATH.read_text())["heavy-tip-1e3"] | dict(mass=[1.0] * 3, t1=5.0)
@@ -153,11 +153,11 @@ def main():
     made["saturated"] = saturated()
     made["stepping"] = stepping()
     made["pulse"] = pulse()
-    path = Path(__file__).with_name("driven_reference.json")
+    path = PATH.with_name("driven_reference.json")
     for kp in STIFFNESSES:
         print(kp, flush=True)
         made[f"stiff-{kp:.0e}"] = stiff(kp)
-        path.write_text(json.dumps(made, indent=1) + "\n")
+        path.write_text(as_text(made))
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""Computes the motions that reference.json holds beside the parameters of its scenes.
+"""Computes the motions in tests/hard/reference.json, beside the scenes' parameters.
 
 A scene is added there, by its parameters alone. Needs heyoka (the extra `benchmark`)
 and about a minute on one core:
 
-    python tests/hard/make_reference.py
+    python -m benchmarks.make_reference
 
 The equations come from the velocities of the mass centres per unit of each joint's
 rate, not from the paper's formulas. heyoka integrates them by Taylor series in 200 bits
@@ -12,12 +12,13 @@ bits, which has to agree. All parameters are doubles, as JSON prints them.
 """
 
 import json
+import re
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 
-PATH = Path(__file__).with_name("reference.json")
+PATH = Path(__file__).parent.parent / "tests/hard/reference.json"
 TIMES = 21  # outputs of each scene, the start among them
 # Derivatives of q at the end in these arguments.
 DERIVATIVES = {
@@ -201,6 +202,12 @@ def agreed(compute, *arguments):
     return value.astype(float)
 
 
+def as_text(scenes):
+    """Returns JSON with each row of numbers on one line."""
+    text = json.dumps(scenes, indent=1) + "\n"
+    return re.sub(r"\[[^][]*\]", lambda row: " ".join(row[0].split()), text)
+
+
 def main():
     scenes = json.loads(PATH.read_text())
     for name, scene in scenes.items():
@@ -213,7 +220,7 @@ def main():
             scene |= dict(qd=qd.tolist(), qdd=qdd.tolist())
         for argument in DERIVATIVES.get(name, ()):
             scene[f"dq_d{argument}"] = agreed(derivative, scene, argument).tolist()
-    PATH.write_text(json.dumps(scenes, indent=1) + "\n")
+    PATH.write_text(as_text(scenes))
 
 
 if __name__ == "__main__":
