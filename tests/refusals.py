@@ -30,8 +30,8 @@ ROOMS = (
 LEFT_OUT = """Condition Drive Efforts Element End Events FitResult Frames
 InertialElement Linearization Load Margins MjcfModel Modes NextMotion Part
 Path PointElement Reference Report Response Scene Sensitivities Solution State
-StatefulElement TuneResult TunedWithin Values accepts_scene clip configure
-controller_in field of_kind switch""".split()
+StatefulElement TuneResult TunedWithin Values accepts_scene called clip configure
+controller_in field naming of_kind switch without_fixed""".split()
 
 # Sound arguments
 
@@ -76,6 +76,7 @@ OWN = {
     "fit_each": dict(observed=np.zeros((1, 5, 3, 2))),
     "geometry": dict(q=ROWS),
     "step_measures": dict(change=TS, rate=np.ones(5), final=1.0),
+    "element_of": dict(value=DAMPER),
     "reference_of": dict(value=TASK),
     "response": dict(forces=(HELD,)),
     "sweep": dict(linkage=stacked(ARM), state0=stacked(START)),

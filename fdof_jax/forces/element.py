@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import PyTree
 
-from ..base.checks import instance, shown
+from ..base.checks import function, instance, shown
 from ..linkage.fields import Foreign, Part, check_joints, default, optional, sized
 from ..linkage.linkage import Linkage, joints_of
 from ..mechanics.equations import Scalars
@@ -118,8 +118,13 @@ class _Opened(ForeignElement):
 
 
 def element_of(value: Callable) -> Element:
-    """Returns an element itself, or a callable `(t, q, qd, linkage) -> tau` as one."""
-    return value if isinstance(value, Element) else ForeignElement(value)
+    """Returns an element itself, or a callable `(t, q, qd, linkage) -> tau` as one.
+
+    **Raises:** ValueError for anything else.
+    """
+    if isinstance(value, Element):
+        return value
+    return ForeignElement(function("value", value, "a force element"))
 
 
 def elements(name: str, forces: Forces) -> tuple[Element, ...]:

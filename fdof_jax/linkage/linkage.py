@@ -157,7 +157,11 @@ def moving_joints(linkage: Linkage) -> list[int]:
 
 
 def joints_of(linkage: Linkage) -> int:
-    """Returns the number of joints, fixed pairs included."""
+    """Returns the number of joints, fixed pairs included.
+
+    **Raises:** ValueError if `linkage` is not a linkage.
+    """
+    instance("linkage", linkage, Linkage)
     return jnp.size(linkage.ef) // 2
 
 
