@@ -1,7 +1,6 @@
 """Laws of all force elements: energy, derivatives and bounds."""
 
 import dataclasses
-from functools import partial
 
 import chains
 import elements
@@ -134,7 +133,6 @@ def scaled(factors):
     return jax.tree.unflatten(STRUCTURE, numbers)
 
 
-@partial(jax.jit, **LOOPS)
 def acts(linkage, forces, t, q, qd, grown):
     """Returns the elements' actions at a moment, in grown states, and first states."""
     args = Args(linkage, q, None, forces)
@@ -148,7 +146,8 @@ def acts(linkage, forces, t, q, qd, grown):
 def acts_of_all():
     """Returns what all elements do at a moment, by one program."""
     forces = jax.tree.map(jnp.asarray, FORCES)
-    return acts(ARM, forces, jnp.array(0.1), *map(jnp.asarray, elements.START), 0.1)
+    start = map(jnp.asarray, elements.START)
+    return jax.jit(acts, **LOOPS)(ARM, forces, jnp.array(0.1), *start, 0.1)
 
 
 @pytest.mark.slow
