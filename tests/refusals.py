@@ -180,8 +180,8 @@ SKIPPED = {
 OF_ITS_OWN = {
     "elements_on.linkage", "sweep.linkage", "to_mjcf.linkage", "to_pandas.linkage",
     "to_xarray.linkage", "reach_margin.ts", "reachable.ts", "PIDController.limit",
-    "fit.observed", "fit_each.observed", "joint_names.linkage", "moving_joints.linkage",
-    "sensitivities.z",
+    "fit.observed", "fit_each.observed", "joint_names.linkage", "joints_of.linkage",
+    "moving_joints.linkage", "sensitivities.z",
 }  # fmt: skip
 # Errors of values that cannot be shown or converted are raised as they are.
 NOT_HOSTILE = {
