@@ -16,7 +16,7 @@ from fdof_jax.steps.looped_dopri8 import LoopedDopri8
 TS = np.linspace(0, 1.5, 7)
 CHUNK = 8  # also what the last few members are solved in
 # As exact as the default solver of batches, which takes three times as long to compile;
-# test_one_compilation.py and hard/test_bad_members.py use that one.
+# test_one_compilation.py and hard/test_batches.py use that one.
 SETTINGS = dict(
     solver=LoopedDopri8(),
     stepsize_controller=diffrax.PIDController(

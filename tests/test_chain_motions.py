@@ -50,7 +50,7 @@ def test_the_two_link_arm_on_its_circle_equals_the_reference():
 def test_gradients_of_a_motion_equal_differences():
     """In reverse mode, with elements in arrays, with inertia and with a state.
 
-    Forward mode is compared with a reference in tests/hard/test_chaos.py.
+    Forward mode is compared with a reference in tests/hard/test_motions.py.
     """
     topology, n = "PFR", 3
     rng = np.random.default_rng(n)

@@ -68,7 +68,7 @@ def by(adjoint):
 
 
 # For `jax.grad`: by tangents in a few numbers, by the adjoint with checkpoints.
-# Forward mode is in hard/test_rest_gradients.py.
+# Forward mode is in hard/test_motions.py.
 by_tangents, by_adjoint = by(diffrax.RecursiveCheckpointAdjoint()), by(ADJOINT)
 
 

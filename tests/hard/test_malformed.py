@@ -39,7 +39,7 @@ WRONG = dict(
 def motion_of(ef, mass, length, q, qd, ts, kp, limit):
     arm = eqx.tree_at(lambda a: (a.ef, a.mass, a.length), ARM, (ef, mass, length))
     pd = eqx.tree_at(lambda pd: (pd.kp, pd.limit), PD, (kp, limit))
-    # Faster to compile than the solver of batches, which test_bad_members.py gives NaN.
+    # Faster to compile than the solver of batches, which test_batches.py gives NaN.
     options = dict(solver=LoopedDopri8(), max_steps=2000, throw=False)
     return fj.simulate(arm, fj.State(q, qd), ts, (pd,), **options)
 
