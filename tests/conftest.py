@@ -26,7 +26,6 @@ LONGEST = {
     "test_derivatives_at_rest",
     "test_signals",
     "test_gradients",
-    "test_switches_at_random",
     "test_forces_guide",
     "test_chain_elements",
     "test_chain_motions",

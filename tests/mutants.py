@@ -32,13 +32,20 @@ class Mutant(NamedTuple):
     check: str
 
 
-AT_ONCE, BRIEF = "tests/test_events_at_once.py", "tests/test_brief_switches.py"
-SWITCHES, HOLDING = "tests/test_switches.py", "tests/test_holding.py"
+BRIEF, SWITCHES = "tests/test_brief_switches.py", "tests/test_switches.py"
+HOLDING, CONDITIONS = "tests/test_holding.py", "tests/test_conditions.py"
 HYBRID = "tests/test_hybrid_dynamics.py"
 KINKS = f"{SWITCHES}::test_kinks_of_high_gains_are_exact_in_derivatives"
 SAMPLED = "tests/test_sampled_control.py"
-CONDITIONS, RESETS = "tests/test_conditions.py", "tests/test_resets.py"
-EVER_FASTER = f"{RESETS}::test_jumps_that_follow_each_other_ever_faster_are_named[0.1]"
+CLOSED_FORMS = f"{CONDITIONS}::test_times_and_states_are_closed_forms"
+COINCIDENT = (
+    f"{SWITCHES}"
+    "::test_each_of_coincident_switches_has_its_own_jump_and_is_said_to_coincide"
+)
+INSTANT = "tests/test_instants.py::test_what_an_instant_cannot_know_is_refused"
+EVER_FASTER = (
+    f"{CONDITIONS}::test_jumps_that_follow_each_other_ever_faster_are_named[0.1]"
+)
 BOUNCES = f"{HOLDING}::test_a_mass_bounces_to_rest_at_a_known_time"
 BATCHED = "tests/test_batched_rules.py"
 ENDS_MOVED = f"{BATCHED}::test_ends_that_only_the_condition_moves"
@@ -81,7 +88,7 @@ MUTANTS = {
         "steps/zeros.py",
         "turning = (-fall > least[None]) & (rise > least[None])",
         "turning = jnp.zeros_like(fall, bool)",
-        f"{AT_ONCE}::test_zeros_of_cubic_polynomials",
+        f"{SWITCHES}::test_zeros_of_cubic_polynomials",
     ),
     "polynomials are trusted": Mutant(
         "steps/zeros.py",
@@ -93,7 +100,7 @@ MUTANTS = {
         "steps/zeros.py",
         "_ITERATIONS = 6",
         "_ITERATIONS = 0",
-        f"{AT_ONCE}::test_zeros_of_cubic_polynomials",
+        f"{SWITCHES}::test_zeros_of_cubic_polynomials",
     ),
     # What switches
     "sides stay": Mutant(
@@ -106,21 +113,19 @@ MUTANTS = {
         "steps/events.py",
         "grazing=jnp.maximum(passed.missed, regime.grazing),",
         "grazing=passed.missed,",
-        f"{SWITCHES}::test_a_motion_tells_of_its_switches",
+        f"{SWITCHES}::test_what_turns_back_just_before_or_beyond_its_zero_is_seen",
     ),
     "one-sided places are not counted": Mutant(
         "steps/events.py",
         "return jnp.maximum(last.one_sided, at_once) + together",
         "return last.one_sided",
-        f"{AT_ONCE}"
-        "::test_each_of_coincident_switches_has_its_own_jump_and_is_said_to_coincide",
+        COINCIDENT,
     ),
     "coincident switches are one": Mutant(
         "steps/events.py",
         "if any(self.jumping) and before.size > 1:",
         "if False:",
-        f"{AT_ONCE}"
-        "::test_each_of_coincident_switches_has_its_own_jump_and_is_said_to_coincide",
+        COINCIDENT,
     ),
     "not moved back after an event": Mutant(
         "steps/events.py",
@@ -359,14 +364,13 @@ MUTANTS = {
         "steps/events.py",
         "lambda: jnp.where(comes, 0, last.late),",
         "lambda: jnp.zeros_like(t),",
-        f"{AT_ONCE}"
-        "::test_what_a_blow_switches_at_once_switches_at_the_time_of_the_blow",
+        f"{CLOSED_FORMS}[a blow switches an effort at once]",
     ),
     "a start on the zero is a passage": Mutant(
         "steps/events.py",
         "passed_zero = passed.switched & ~on_zero",
         "passed_zero = passed.switched",
-        f"{RESETS}::test_where_a_reset_leaves_its_condition",
+        f"{CONDITIONS}::test_where_a_reset_leaves_its_condition",
     ),
     "what follows soon is not seen": Mutant(
         "steps/landing.py",
@@ -391,14 +395,13 @@ MUTANTS = {
         "steps/events.py",
         "end, there = at_zero(self.term, t, y, args, which, ended & comes)",
         "end, there = t, y",
-        f"{CONDITIONS}::test_a_fall_ends_on_the_floor",
+        f"{CLOSED_FORMS}[a fall ends on the floor]",
     ),
     "a jump over a zero is a passage": Mutant(
         "steps/events.py",
         "end, there = at_zero(self.term, t, y, args, which, ended & comes)",
         "end, there = at_zero(self.term, t, y, args, which, ended)",
-        f"{CONDITIONS}"
-        "::test_a_jump_that_carries_a_condition_over_its_zero_ends_the_motion_there",
+        f"{CLOSED_FORMS}[a blow carries the condition over its zero]",
     ),
     "conditions have no direction": Mutant(
         "steps/exact_zeros.py",
@@ -416,26 +419,25 @@ MUTANTS = {
         "steps/exact_zeros.py",
         "_NEWTON, _CONVERGED = 3, 0.01",
         "_NEWTON, _CONVERGED = 1, 2.0",
-        f"{CONDITIONS}::test_a_fall_ends_on_the_floor",
+        f"{CLOSED_FORMS}[a fall ends on the floor]",
     ),
     "straight to a zero": Mutant(
         "steps/exact_zeros.py",
         "middle = _along(y, time / 2, term.vf(t, y, args))",
         "middle = y",
-        f"{CONDITIONS}"
-        "::test_a_bar_comes_to_its_lowest_point_in_the_time_of_an_elliptic_integral",
+        f"{CLOSED_FORMS}[a bar hangs after an elliptic integral]",
     ),
     "a reset takes no energy": Mutant(
         "simulation/events.py",
         "jnp.subtract(*energies)",
         "jnp.zeros_like(t)",
-        f"{RESETS}::test_a_ball_that_is_reset_bounces_as_on_a_stop",
+        f"{CLOSED_FORMS}[a ball is reset twenty times]",
     ),
     "a reset may leave hard stops": Mutant(
         "simulation/events.py",
         "qd = jnp.where(within_stops(args.forces, q, arm), qd, jnp.nan)",
         "pass",
-        f"{RESETS}::test_functions_that_return_what_cannot_be_are_named"
+        f"{CONDITIONS}::test_functions_that_return_what_cannot_be_are_named"
         "[wrong3-beyond a hard stop]",
     ),
     "what a reset turns round goes on": Mutant(
@@ -448,7 +450,45 @@ MUTANTS = {
         "steps/landing.py",
         "power = jnp.where(found.resets, _RESET_PACE, _PACE)",
         "power = _PACE",
-        f"{RESETS}::test_where_a_reset_leaves_its_condition",
+        f"{CONDITIONS}::test_where_a_reset_leaves_its_condition",
+    ),
+    # At an instant
+    "a switch within a transformation goes unseen": Mutant(
+        "forces/switches.py",
+        "if self._transformation != transformation():",
+        "if False:",
+        f"{SWITCHES}::test_a_switch_that_the_integrator_cannot_see_is_refused[jit]",
+    ),
+    "what holds joints is free at an instant": Mutant(
+        "forces/holders.py",
+        "if isinstance(element, Holder) and element.holds:",
+        "if False:",
+        f"{INSTANT}[equilibrium]",
+    ),
+    "masses of any time are those of one": Mutant(
+        "forces/added_inertia.py",
+        "element.at(_ANY) is not element:",
+        "element.at(_ANY) is None:",
+        f"{INSTANT}[mass_matrix]",
+    ),
+    "a sampled control acts beside its held efforts": Mutant(
+        "simulation/efforts.py",
+        "return _Held(motion.ts, motion.acting), *forces[1:]",
+        "return _Held(motion.ts, motion.acting), *forces",
+        f"{SAMPLED}::test_held_efforts_are_known_with_their_work",
+    ),
+    "a ramp goes on after its last time": Mutant(
+        "references/signals.py",
+        "return q, jnp.where(before | behind, 0, rates)",
+        "return q, jnp.where(before, 0, rates)",
+        "tests/test_signals.py::test_ramps_stand_before_and_after_their_times",
+    ),
+    "no kept step shortens the next": Mutant(
+        "steps/tolerances.py",
+        "shortened = keep & (factor < 1) & (inverse_error != 1)",
+        "shortened = keep & (factor < 0)",
+        "tests/test_step_control.py"
+        "::test_a_kept_step_near_the_tolerance_shortens_the_next",
     ),
 }
 

@@ -27,7 +27,6 @@ class Case(eqx.Module):
 
 LIMITED = Case(1.0, 0.0, 1, 1.9, 1.0)
 CABLE = Case(0.0, 1.0, 1, 1.9, 0.8)
-BUMPER = Case(0.0, 1.0, -1, 1.6, 0.8)
 
 
 def scene(x, case):

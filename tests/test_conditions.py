@@ -1,4 +1,4 @@
-"""Motions that end where a condition is met: closed forms, derivatives."""
+"""Motions that end or jump where a condition is met: closed forms, derivatives."""
 
 from functools import partial
 
@@ -7,69 +7,97 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from modes import LOOPS, hessian, jacobian
-from scipy.integrate import solve_ivp
-from scipy.special import ellipk
+from modes import LOOPS
 
 import fdof_jax as fj
+from fdof_jax.forces import HardStops, Payload, Reset, switch
 from fdof_jax.simulation import Until
+from fdof_jax.steps.looped_dopri8 import LoopedDopri8
 
 MASS = fj.Linkage(
     "P", length=[0, 0], com=[[0, 0]], mass=[1], inertia=[1], base_angle=0
 )  # upwards
 BAR = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[1 / 12])
 HANGS = -np.pi / 2  # the angle of a bar that hangs
-FORWARD = dict(adjoint=diffrax.ForwardMode())
 
 
 def height(t, q, qd, linkage):
     return q[0]
 
 
-def fall(x, floor=None, **options):
-    """Returns the end of a fall from a height to another, thrown upwards."""
-    q0, qd0, gravity, last = x
-    floor = last if floor is None else floor
-    above = lambda t, q, qd, linkage: q[0] - floor
-    start = fj.State(jnp.stack([q0]), jnp.stack([qd0]))
-    arm = MASS.replace(gravity=gravity)
-    motion = fj.simulate(arm, start, [0, 1, 2.0, 9.0], until=above, **options)
-    return jnp.stack([motion.end.t, motion.end.q[0], motion.end.qd[0]])
+def bounce(restitution):
+    return Reset(height, lambda t, q, qd, linkage: (q, -restitution * qd), -1)
 
 
-def fallen(x):
-    q0, qd0, gravity, floor = x
-    fast = jnp.sqrt(qd0**2 + 2 * gravity * (q0 - floor))
-    return jnp.stack([(qd0 + fast) / gravity, floor, -fast])
+# What may happen to one joint, by numbers of programs that all cases share: it hits a
+# floor; is reset at q = at + rise t, `up` and `down` being factors of its rate; is
+# driven by an effort that switches with its rate if `side` is 1; and ends where
+# stop_q q + stop_qd qd falls through stop_at, or where a bar hangs.
+NOTHING = dict(
+    q0=0.0, qd0=0.0, gravity=9.81, mass=1.0, t1=9.0, restitution=0.0,
+    at=0.0, rise=0.0, lift=0.0, up=1.0, down=1.0, add=0.0, side=0.0, above=0.0,
+    below=0.0, stop_q=0.0, stop_qd=0.0, stop_at=-1.0,
+)  # fmt: skip
 
 
-@pytest.mark.slow
-def test_a_fall_ends_on_the_floor():
-    """With first and second derivatives in all numbers, the condition's own too."""
-    x = jnp.array([10.0, 1.0, 9.81, 0.3])
-    forward, values = jacobian(partial(fall, **FORWARD))(x)
-    reverse = jax.jit(jax.jacrev(fall), **LOOPS)(x)
-    np.testing.assert_allclose(values, fallen(x), rtol=1e-12)
-    exact = jax.jacfwd(fallen)
-    for slopes in (forward, reverse):
-        np.testing.assert_allclose(slopes, exact(x), rtol=1e-10, atol=1e-12)
-    on_floor = lambda x: fall(jnp.append(x, 0.3), floor=0.3, **FORWARD)
-    curves, *_ = hessian(on_floor)(x[:3])
-    np.testing.assert_allclose(curves, jax.jacfwd(exact)(x)[:, :3, :3], atol=1e-10)
+def ends(x):
+    return (Until(lambda t, q, qd, linkage: q[0] - HANGS, -1),)
 
 
-@pytest.mark.slow
-def test_rows_after_the_end_are_not_there():
-    motion = fj.simulate(MASS, fj.State([10.0], [1.0]), [0, 1, 2.0], until=height)
-    assert bool(motion.ended) and motion.outcome == "ended"
-    assert motion.result == diffrax.RESULTS.successful
-    assert np.isfinite(motion.q[:2]).all() and np.isnan(motion.q[2:]).all()
-    np.testing.assert_allclose(motion.stats["time_reached"], motion.end.t)
-    assert "ended" in repr(motion)
-    free = fj.simulate(MASS, fj.State([10.0], [1.0]), [0, 1.0], until=height)
-    assert not free.ended and free.outcome == "successful"
-    np.testing.assert_array_equal(free.end.q, free.q[-1])
-    assert (free.end.t, free.end.condition) == (1, -1)
+def resets(x):
+    when = lambda t, q, qd, linkage: q[0] - x["at"] - x["rise"] * t
+    factor = lambda qd: jnp.where(qd > 0, x["up"], x["down"])
+    then = lambda t, q, qd, linkage: (q + x["lift"], factor(qd) * qd + x["add"])
+    return (Reset(when, then),)
+
+
+def blows(x):
+    push = lambda t, q, qd, linkage: switch(
+        qd - 1 + x["side"], x["above"] + 0 * q, x["below"] + 0 * q
+    )
+    g = lambda t, q, qd, linkage: (
+        x["stop_q"] * q[0] + x["stop_qd"] * qd[0] - x["stop_at"]
+    )
+    return HardStops(0.0, jnp.inf, restitution=x["restitution"]), push, Until(g, -1)
+
+
+def motion(forces, x, arm, **options):
+    arm = arm.replace(gravity=x["gravity"], mass=x["mass"][None])
+    start = fj.State(x["q0"][None], x["qd0"][None])
+    ts = jnp.stack([0 * x["t1"], x["t1"]])
+    found = fj.simulate(arm, start, ts, forces(x), **options)
+    if forces is resets:
+        return dict(q=found.q[1, 0], qd=found.qd[1, 0], jumps=found.events.t[:20],
+                    taken=found.taken[1])  # fmt: skip
+    return dict(t=found.end.t, q=found.end.q[0], qd=found.end.qd[0])
+
+
+def along(function, x, one, *rest):
+    """Returns values, and their derivatives along `one`."""
+    return jax.jvp(lambda x: function(x, *rest), (x,), (one,))
+
+
+def twice(function, x, one, *rest):
+    """Returns the same, and the derivatives of both along `one`."""
+    return along(partial(along, function), x, one, one, *rest)
+
+
+FORWARD = dict(adjoint=diffrax.ForwardMode())
+of_ends = jax.jit(partial(twice, partial(motion, ends, **FORWARD)), **LOOPS)
+of_blows = jax.jit(partial(along, partial(motion, blows, **FORWARD)), **LOOPS)
+
+
+@partial(jax.jit, **LOOPS)
+def of_resets(x, one, arm, known):
+    """Returns values, and the derivative along `one` of the sum of known ones."""
+
+    def total(s):
+        moved = jax.tree.map(lambda a, b: a + s * b, x, one)
+        found = motion(resets, moved, arm)
+        return sum(jnp.sum(jnp.where(known[k], found[k], 0)) for k in known), found
+
+    slope, found = jax.grad(total, has_aux=True)(0.0)
+    return found, slope
 
 
 def quarter(sine2):
@@ -80,180 +108,222 @@ def quarter(sine2):
     return np.pi / 2 / a
 
 
-def lowest(x, **options):
-    """Returns time, angle and rate of a bar at its lowest point, from rest."""
-    gravity, mass, q0 = x
-    bar = BAR.replace(gravity=gravity, mass=mass[None])
-    there = lambda t, q, qd, linkage: q[0] - HANGS
-    start = fj.State(q0[None], jnp.zeros(1))
-    *end, _ = fj.simulate(bar, start, [0, 9.0], until=there, **options).end
-    return jnp.hstack(end)
+def of_fall(q0, qd0, gravity, stop_at, **_):
+    fast = jnp.sqrt(qd0**2 + 2 * gravity * (q0 - stop_at))
+    return dict(t=(qd0 + fast) / gravity, q=stop_at, qd=-fast)
 
 
-def lowest_exactly(x):
-    gravity, mass, q0 = x
+def of_bar(q0, gravity, mass, **_):
     moment, inertia = mass * gravity / 2, 1 / 12 + mass / 4
     time = jnp.sqrt(inertia / moment) * quarter(jnp.sin((q0 - HANGS) / 2) ** 2)
     rate = -jnp.sqrt(2 * moment / inertia * (1 + jnp.sin(q0)))
-    return jnp.stack([time, jnp.full_like(time, HANGS), rate])
+    return dict(t=time, q=HANGS, qd=rate)
+
+
+def of_swing(qd0, gravity, **_):
+    pace = 1.5 * gravity
+    time = 2 * quarter(qd0**2 / 4 / pace) / jnp.sqrt(pace)
+    return dict(t=time, q=HANGS, qd=-qd0)
+
+
+def of_blow(q0, gravity, restitution, **_):
+    fast = jnp.sqrt(2 * gravity * q0)
+    return dict(t=fast / gravity, q=0 * q0, qd=restitution * fast)
+
+
+def of_push(q0, gravity, restitution, above, below, t1, **_):
+    fall = jnp.sqrt(2 * q0 / (gravity - below))
+    speed, rest = restitution * (gravity - below) * fall, t1 - fall
+    pull = gravity - above
+    return dict(q=speed * rest - pull * rest**2 / 2, qd=speed - pull * rest)
+
+
+def of_table(q0, gravity, rise, lift, down, add, t1, **_):
+    speed = jnp.sqrt(rise**2 + 2 * gravity * q0)
+    blow = (speed - rise) / gravity
+    back, since = down * (rise - speed) + add, t1 - blow
+    q = rise * blow + lift + back * since - gravity * since**2 / 2
+    return dict(q=q, qd=back - gravity * since, jumps=blow[None])
+
+
+def of_twenty(q0, gravity, down, t1, **_):
+    fall, kept = jnp.sqrt(2 * q0 / gravity), -down
+    jumps = fall * jnp.cumsum((2 * kept ** jnp.arange(20)).at[0].set(1))
+    speed, since = kept**20 * gravity * fall, t1 - jumps[-1]
+    q, qd = speed * since - gravity * since**2 / 2, speed - gravity * since
+    return dict(q=q, qd=qd, jumps=jumps, taken=gravity * q0 * (1 - kept**40))
+
+
+# Programs, closed forms, arms, numbers that vary, and those that do not.
+CASES = {
+    "a fall ends on the floor": (
+        of_ends, of_fall, MASS, dict(q0=10.0, qd0=1.0, gravity=9.81),
+        dict(stop_at=HANGS),
+    ),
+    "a bar hangs after an elliptic integral": (
+        of_ends, of_bar, BAR, dict(q0=0.0, gravity=9.81, mass=1.3), {}
+    ),
+    "a bar that starts on the zero returns after half its period": (
+        of_ends, of_swing, BAR, dict(qd0=5.0, gravity=9.81), dict(q0=HANGS)
+    ),
+    "a level ends a fall": (
+        of_blows, of_fall, MASS, dict(q0=10.0, qd0=1.0, gravity=9.81, stop_at=0.3),
+        dict(stop_q=1.0),
+    ),
+    "a blow carries the condition over its zero": (
+        of_blows, of_blow, MASS, dict(q0=1.0, gravity=9.81, restitution=0.6),
+        dict(stop_qd=-1.0),
+    ),
+    "a blow switches an effort at once": (
+        of_blows, of_push, MASS,
+        dict(q0=1.0, gravity=9.81, restitution=0.9, above=-4.0, below=1.0, t1=0.7),
+        dict(side=1.0),
+    ),
+    "a ball is thrown by a table that rises": (
+        of_resets, of_table, MASS,
+        dict(q0=1.0, gravity=9.81, rise=0.5, lift=0.05, down=-0.6, add=0.8, t1=0.6), {},
+    ),
+    "a ball is reset twenty times": (
+        of_resets, of_twenty, MASS, dict(q0=1.0, gravity=9.81, down=-0.95, t1=11.3), {},
+    ),
+}  # fmt: skip
 
 
 @pytest.mark.slow
-def test_a_bar_comes_to_its_lowest_point_in_the_time_of_an_elliptic_integral():
-    """With first and second derivatives in gravity, its mass and the first angle."""
-    x = jnp.array([9.81, 1.3, 0.0])  # from level
-    at_level = np.sqrt((1 / 12 + 1.3 / 4) / (1.3 * 9.81 / 2)) * ellipk(1 / 2)
-    np.testing.assert_allclose(lowest_exactly(x)[0], at_level, rtol=1e-15)
-    curves, forward, values = hessian(partial(lowest, **FORWARD))(x)
-    reverse = jax.jit(jax.jacrev(lowest), **LOOPS)(x)
-    np.testing.assert_allclose(values, lowest_exactly(x), rtol=0, atol=1e-11)
-    exact = jax.jacfwd(lowest_exactly)
-    for slopes in (forward, reverse):
-        np.testing.assert_allclose(slopes, exact(x), rtol=0, atol=1e-10)
-    np.testing.assert_allclose(curves, jax.jacfwd(exact)(x), rtol=0, atol=1e-10)
-
-
-@pytest.mark.slow
-def test_a_thousand_members_of_a_sweep_end_as_each_does_alone():
+@pytest.mark.parametrize("name", CASES)
+def test_times_and_states_are_closed_forms(name):
+    """With derivatives along a random change of the numbers that vary."""
+    program, exactly, arm, varied, fixed = CASES[name]
+    x = {k: jnp.array(v) for k, v in (NOTHING | varied | fixed).items()}
     rng = np.random.default_rng(0)
-    starts = fj.State(rng.uniform(-1.5, 1.5, (1000, 1)), rng.uniform(-3, 3, (1000, 1)))
-    there = Until(lambda t, q, qd, linkage: q[0] - HANGS)
-    swept = fj.sweep(BAR, starts, [0, 9.0], (there,)).end
-    one = jax.jit(lambda start: fj.simulate(BAR, start, [0, 9.0], (there,)).end)
-    alone = [one(fj.State(*rows)) for rows in zip(*starts)]
-    alone = jax.tree.map(lambda *rows: np.stack(rows), *alone)
-    jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, atol=1e-10), swept, alone
-    )
-
-
-@pytest.mark.slow
-def test_the_period_of_a_pendulum_and_its_derivative():
-    """A bar that starts on the zero returns there, upwards, a period later."""
-    returns = Until(lambda t, q, qd, linkage: q[0] - HANGS, direction=1)
-
-    def period(speed):
-        start = fj.State(jnp.array([HANGS]), jnp.stack([speed]))
-        return fj.simulate(BAR, start, [0, 60.0], until=returns, **FORWARD).end.t
-
-    # Energy: qd^2 / 2 = (3 g / 2 L) (1 - cos a) at the amplitude a.
-    squared = lambda speed: speed**2 / (6 * 9.81)  # sin(a / 2)^2
-    exact = lambda speed: 4 * ellipk(squared(speed)) / np.sqrt(1.5 * 9.81)
-    of = jax.jit(lambda x: jax.jvp(period, (x,), (jnp.ones_like(x),)), **LOOPS)
-    for speed in (0.5, 5.0, 7.6):  # over the top at 7.67
-        found, slope = of(speed)
-        np.testing.assert_allclose(found, exact(speed), rtol=1e-9)
-        h = 1e-5 * speed
-        difference = (exact(speed + h) - exact(speed - h)) / (2 * h)
-        np.testing.assert_allclose(slope, difference, rtol=2e-5)
-
-
-@pytest.mark.slow
-def test_the_end_is_that_of_scipy():
-    """A double pendulum with dampers, until its tip crosses a line downwards."""
-    arm = fj.scenes.double_pendulum().linkage
-    damper = fj.JointDamper(0.3)
-
-    def line(t, q, qd, linkage):
-        tip = fj.tip_position(linkage, q)
-        return tip[1] + 0.2 * tip[0] + 0.1 * t
-
-    rates = jax.jit(
-        lambda t, y: jnp.concatenate(
-            [y[2:], fj.forward_dynamics(arm, y[:2], y[2:], -0.3 * y[2:])]
+    one = {k: rng.uniform(0.5, 1) * (k in varied) for k in x}
+    (right, slopes), (_, curves) = twice(lambda x: exactly(**x), x, one)
+    if program is of_ends:
+        (found, first), (_, second) = program(x, one, arm)
+    elif program is of_blows:
+        found, first = program(x, one, arm)
+    else:
+        # Of the jumps of all that programs share, only some happen.
+        count = right["jumps"].size
+        known = dict(
+            q=True, qd=True, taken="taken" in right, jumps=np.arange(20) < count
         )
-    )
-    value = jax.jit(lambda t, y: line(t, y[:2], y[2:], arm))
-    crossing = lambda t, y: float(value(t, y))
-    crossing.terminal, crossing.direction = True, -1
-    tolerances = dict(rtol=1e-12, atol=1e-12, method="DOP853")
-    for q0 in ([0.7, 0.4], [1.2, -0.5], [0.2, 1.0]):
-        y0 = np.array([*q0, 0.1, -0.2])
-        exact = solve_ivp(rates, (0, 20), y0, events=crossing, **tolerances)
-        motion = fj.simulate(
-            arm, fj.State(y0[:2], y0[2:]), [0, 20.0], (damper,), until=Until(line, -1)
-        )
-        (time,), (state,) = exact.t_events[0], exact.y_events[0]
-        np.testing.assert_allclose(motion.end.t, time, rtol=1e-9)
-        found = np.concatenate([motion.end.q, motion.end.qd])
-        np.testing.assert_allclose(found, state, atol=1e-8)
+        found, total = program(x, one, arm, known)
+        wanted = sum(jnp.sum(slope) for slope in slopes.values())
+        np.testing.assert_allclose(total, wanted, rtol=1e-9)
+        found["jumps"] = found["jumps"][:count]
+    for k, value in right.items():
+        np.testing.assert_allclose(found[k], value, rtol=1e-11, atol=1e-11)
+        if program is not of_resets:
+            np.testing.assert_allclose(first[k], slopes[k], rtol=1e-9, atol=1e-9)
+        if program is of_ends:
+            np.testing.assert_allclose(second[k], curves[k], rtol=1e-8, atol=1e-8)
 
 
 @pytest.mark.slow
 def test_the_first_of_several_ends_it():
-    start = fj.State([10.0], [1.0])
-    top = Until(lambda t, q, qd, linkage: qd[0], -1)
-    late = lambda t, q, qd, linkage: t - 0.5
-    ends = {
-        (height, top): 1, (top, height): 0, (height, late): 1,
-        (Until(top.condition, 1), height): 1,  # the speed falls through 0
-    }  # fmt: skip
-    for until, first in ends.items():
-        assert fj.simulate(MASS, start, [0, 9.0], until=until).end.condition == first
-    at_top = fj.simulate(MASS, start, [0, 9.0], until=top).end
-    np.testing.assert_allclose(at_top.t, 1 / 9.81, rtol=1e-12)
+    """The speed falls through 0, which the first condition does not count."""
+    speed = lambda t, q, qd, linkage: qd[0]
+    until, ts = (Until(speed, 1), height, Until(speed, -1)), [0, 0.1, 2.0]
+    motion = fj.simulate(MASS, fj.State([10.0], [1.0]), ts, until=until)
+    np.testing.assert_allclose([*motion.end][::3], [1 / 9.81, 2], rtol=1e-12)
+    assert motion.ended and motion.outcome == "ended" and "ended" in repr(motion)
+    np.testing.assert_allclose(motion.stats["time_reached"], motion.end.t, rtol=1e-9)
+    assert np.isfinite(motion.q[:2]).all() and np.isnan(motion.q[2:]).all()
+    free = fj.simulate(MASS, fj.State([10.0], [1.0]), [0, 0.05], until=until)
+    assert not free.ended and free.outcome == "successful"
+    assert (free.end.t, free.end.condition) == (0.05, -1)
+    np.testing.assert_array_equal(free.end.q, free.q[-1])
 
 
 @pytest.mark.slow
-def test_a_jump_that_carries_a_condition_over_its_zero_ends_the_motion_there():
-    """A bounce, with its derivatives, and a payload."""
-    rises = Until(lambda t, q, qd, linkage: qd[0] - 1, direction=1)
-
-    def bounced(x, **options):
-        q0, gravity, restitution = x
-        stop = fj.forces.HardStops(0, jnp.inf, restitution=restitution)
-        arm, start = MASS.replace(gravity=gravity), fj.State(q0[None], jnp.zeros(1))
-        end = fj.simulate(arm, start, [0, 2.0], (stop,), until=rises, **options).end
-        return jnp.stack([end.t, end.q[0], end.qd[0]])
-
-    def exactly(x):
-        q0, gravity, restitution = x
-        fast = jnp.sqrt(2 * gravity * q0)
-        return jnp.stack([fast / gravity, 0 * q0, restitution * fast])
-
-    x = jnp.array([1.0, 9.81, 0.6])
-    forward, values = jacobian(partial(bounced, **FORWARD))(x)
-    reverse = jax.jit(jax.jacrev(bounced), **LOOPS)(x)
-    np.testing.assert_allclose(values, exactly(x), atol=1e-11)
-    for slopes in (forward, reverse):
-        np.testing.assert_allclose(slopes, jax.jacfwd(exactly)(x), atol=1e-10)
-    load = fj.forces.Payload(fj.Point(1, 1.0), mass=1.5, begin=0.5, end=2.0)
-    slows, arm = lambda t, q, qd, linkage: qd[0] - 1, BAR.replace(gravity=0)
-    start = fj.State([0.0], [2.0])
-    end = fj.simulate(arm, start, [0, 1.0], (load,), until=slows).end
-    kept = (1 / 3) / (1 / 3 + 1.5)
-    found = [end.t, end.q[0], end.qd[0]]
-    np.testing.assert_allclose(found, [0.5, 1, 2 * kept], atol=1e-12)
+def test_members_of_a_sweep_jump_and_end_by_themselves():
+    speeds = np.array([0.0, 30.0, np.nan])
+    start = fj.State(np.ones((3, 1)), speeds[:, None])
+    rises = Until(lambda t, q, qd, linkage: q[0] - 0.2, direction=1)
+    forces = bounce(0.5), rises
+    swept = fj.sweep(MASS, start, [0, 0.9], forces, solver=LoopedDopri8())
+    assert swept.outcome.tolist() == ["ended", "successful", "not finite"]
+    assert swept.events.count.tolist() == [1, 0, 0]
+    fall, up = np.sqrt(2 / 9.81), np.sqrt(2 * 9.81) / 2
+    end = fall + (up - np.sqrt(up**2 - 2 * 9.81 * 0.2)) / 9.81
+    np.testing.assert_allclose(swept.end.t[:2], [end, 0.9], rtol=1e-11)
 
 
 @pytest.mark.slow
-def test_members_of_a_batch_end_by_themselves():
-    """One ends, one never does, one fails; in a sweep, too, where it is an element."""
-    speeds = jnp.array([1.0, 100.0, jnp.nan, 2.0])
-    start = fj.State(jnp.zeros((4, 1)), speeds[:, None])
-    one = lambda start: fj.simulate(MASS, start, [0, 9.0], until=height, throw=False)
-    motions = jax.jit(jax.vmap(one), **LOOPS)(start)
-    outcomes = ["ended", "successful", "not finite", "ended"]
-    assert motions.outcome.tolist() == outcomes
-    expected = [2 / 9.81, 9, np.nan, 4 / 9.81]
-    np.testing.assert_allclose(np.delete(motions.end.t, 2), np.delete(expected, 2))
-    swept = fj.sweep(MASS, start, [0, 9.0], (Until(height),))
-    assert swept.outcome.tolist() == outcomes
-    np.testing.assert_allclose(swept.end.t, motions.end.t, rtol=1e-12)
+def test_jumps_over_other_conditions_are_those_there():
+    """A payload slows a bar; so it is lifted over where it is pushed."""
+    load = Payload(fj.Point(1, 1.0), mass=1.5, begin=0.5)
+    slow = lambda t, q, qd, linkage: qd[0] - 1
+    lifts = Reset(slow, lambda t, q, qd, linkage: (q + 1, qd), -1)
+    over = lambda t, q, qd, linkage: q[0] - 1.5
+    pushes = Reset(over, lambda t, q, qd, linkage: (q, qd + 0.5), 1)
+    start, arm = fj.State([0.0], [2.0]), BAR.replace(gravity=0)
+    motion = fj.simulate(arm, start, [0, 1.0], (pushes, lifts, load))
+    table = motion.events.table
+    assert table["event"].tolist() == ["is reset"] * 2 and not table["joint"].any()
+    np.testing.assert_allclose(table["t [s]"], 0.5, rtol=1e-12)
+    speed = 2 * (1 / 3) / (1 / 3 + 1.5) + 0.5
+    np.testing.assert_allclose(motion.qd[-1], speed, rtol=1e-11)
+    np.testing.assert_allclose(motion.q[-1], 2 + speed / 2, rtol=1e-11)
 
 
 @pytest.mark.slow
-def test_what_holds_joints_and_samples_goes_on_until_the_end():
-    stop = fj.forces.HardStops(0, np.inf, restitution=0.5)
-    slow = Until(lambda t, q, qd, linkage: q[0] - 0.2, direction=1)
-    motion = fj.simulate(MASS, fj.State([1.0], [0.0]), [0, 9.0], (stop,), until=slow)
-    fast = np.sqrt(2 * 9.81)
-    up = 0.5 * fast
-    time = fast / 9.81 + (up - np.sqrt(up**2 - 2 * 9.81 * 0.2)) / 9.81
-    np.testing.assert_allclose(motion.end.t, time, rtol=1e-10)
-    assert motion.events.count == 1
-    push = lambda t, q, qd, linkage: jnp.array([9.81 + 1.0])
-    start, until = fj.State([0.0], [0.0]), lambda t, q, qd, linkage: q[0] - 0.5
-    sampled = fj.simulate_sampled(MASS, start, push, 0.3, 9, until=until)
-    np.testing.assert_allclose(sampled.end.t, 1, rtol=1e-9)
-    assert np.isnan(sampled.tau[5:]).all() and np.isfinite(sampled.tau[:4]).all()
+@pytest.mark.parametrize("restitution", [0.1, 0.8])
+def test_jumps_that_follow_each_other_ever_faster_are_named(restitution):
+    """Of a ball that comes to rest, after a time that its restitution gives."""
+    switches = lambda t, q, qd, linkage: switch(q[0] - 0.9, 0 * q, 0 * q)
+    forces = (bounce(jnp.array(restitution)), switches)
+    scene = MASS, fj.State([1.0], [0.0]), [0, 9.0], forces
+    motion = fj.simulate(*scene, throw=False)
+    assert motion.outcome == "too many switches"
+    rests = np.sqrt(2 / 9.81) * (1 + restitution) / (1 - restitution)
+    np.testing.assert_allclose(motion.stats["time_reached"], rests, rtol=1e-5)
+    with pytest.raises(RuntimeError, match=r"is reset\. forces\[0\] \(Reset\)"):
+        fj.simulate(*scene)
+
+
+@pytest.mark.slow
+def test_where_a_reset_leaves_its_condition():
+    """On its zero, beyond it, or before it, from where it comes again."""
+
+    def moved(start, shift, factor):
+        jumps = Reset(height, lambda t, q, qd, linkage: (q + shift, factor * qd))
+        scene = MASS.replace(gravity=0), fj.State([start], [1.0]), [0, 1.0], (jumps,)
+        return fj.simulate(*scene, throw=False)
+
+    for start, shift, factor, end in [
+        (0.0, 0.0, -1.0, 1.0),  # it starts on the zero
+        (-0.5, 0.0, -1.0, -0.5),
+        (-0.5, 0.0, 2.0, 1.0),  # it goes on
+        (-0.5, 0.3, 1.0, 0.8),
+        (-0.5, -0.3, 1.0, -0.1),  # and twice
+    ]:
+        found = moved(start, shift, factor).q[-1, 0]
+        np.testing.assert_allclose(found, end, atol=1e-12)
+    assert moved(-0.5, -1e-9, 1.0).outcome == "too many switches"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "wrong, words",
+    [
+        (dict(floor=np.nan), r"forces\[0\] is not finite"),
+        (dict(low=np.nan), r"effort of forces\[1\] is not finite"),
+        (dict(kept=np.nan), "new values are"),
+        (dict(lift=9.0), "beyond a hard stop"),
+    ],
+)
+def test_functions_that_return_what_cannot_be_are_named(wrong, words):
+    def motion(floor=0.0, low=-9.0, kept=-0.5, lift=0.0):
+        jumps = Reset(
+            lambda t, q, qd, linkage: q[0] - floor,
+            lambda t, q, qd, linkage: (q + lift, kept * qd),
+        )
+        ends = Until(lambda t, q, qd, linkage: q[0] - low)
+        forces = jumps, ends, HardStops(-np.inf, 2.0)
+        return fj.simulate(MASS, fj.State([1.0], [0.0]), [0, 0.7], forces)
+
+    assert motion().events.count == 1
+    with pytest.raises(RuntimeError, match=words):
+        motion(**wrong)
