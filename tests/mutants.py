@@ -35,11 +35,13 @@ class Mutant(NamedTuple):
 AT_ONCE, BRIEF = "tests/test_events_at_once.py", "tests/test_brief_switches.py"
 SWITCHES, HOLDING = "tests/test_switches.py", "tests/test_holding.py"
 HYBRID = "tests/test_hybrid_dynamics.py"
+MASSES = "tests/test_changing_masses.py"
 KINKS = f"{SWITCHES}::test_kinks_of_high_gains_are_exact_in_derivatives"
 SAMPLED = "tests/test_sampled_control.py"
 CONDITIONS, RESETS = "tests/test_conditions.py", "tests/test_resets.py"
 EVER_FASTER = f"{RESETS}::test_jumps_that_follow_each_other_ever_faster_are_named[0.1]"
-BOUNCES = f"{HOLDING}::test_a_mass_bounces_to_rest_at_a_known_time"
+ONE_JOINT = f"{HOLDING}::test_one_joint_moves_as_closed_forms_say"
+BOUNCES = f"{ONE_JOINT}[a ball bounces to rest]"
 BATCHED = "tests/test_batched_rules.py"
 ENDS_MOVED = f"{BATCHED}::test_ends_that_only_the_condition_moves"
 FIRST_ENDS = f"{CONDITIONS}::test_the_first_of_several_ends_it"
@@ -151,7 +153,8 @@ MUTANTS = {
         "steps/switch_derivatives.py",
         "middle = _straight(late / 2, y, term.vf(t, y, args))",
         "middle = y",
-        f"{HOLDING}::test_second_derivatives_through_a_blow",
+        f"{HOLDING}"
+        "::test_second_derivatives_of_slides_that_bounce_off_a_stop_and_come_to_rest",
     ),
     "products alike for all members": Mutant(
         "steps/switch_derivatives.py",
@@ -227,7 +230,7 @@ MUTANTS = {
         "simulation/events.py",
         "e = law.restitution[k]",
         "e = constant(law.restitution[k])",
-        "tests/test_held_bounces.py::test_derivatives_through_a_hundred_bounces",
+        f"{HOLDING}::test_a_batch_has_the_derivatives_of_closed_forms",
     ),
     "low flights go on": Mutant(
         "simulation/events.py",
@@ -239,13 +242,13 @@ MUTANTS = {
         "simulation/events.py",
         "_BOUNCES: hit & (law.restitution > 0),",
         "_BOUNCES: hit,",
-        f"{HOLDING}::test_a_blow_without_restitution_is_no_bounce[9.0-is stopped]",
+        f"{ONE_JOINT}[a blow without restitution, and a pull away]",
     ),
     "rounding frees joints": Mutant(
         "simulation/events.py",
         "rests = joints & (jnp.abs(constant(qd)) <= constant(still))",
         "rests = joints & (qd == 0)",
-        "tests/test_held_rounding.py::test_a_rounding_error_frees_no_joint",
+        f"{HOLDING}::test_a_rounding_error_frees_no_joint",
     ),
     "a payload takes no energy": Mutant(
         "simulation/events.py",
@@ -282,7 +285,44 @@ MUTANTS = {
         "simulation/holding.py",
         "static = jnp.where(law.braked, jnp.inf, law.static)",
         "static = jnp.where(law.braked, jnp.inf, law.level)",
-        f"{HOLDING}::test_static_friction_holds_what_has_come_to_rest_only",
+        f"{ONE_JOINT}[static friction holds what has come to rest]",
+    ),
+    # What acts on held and prescribed joints
+    "events are turned the wrong way": Mutant(
+        "simulation/events.py",
+        "jnp.roll(row, -first)",
+        "jnp.roll(row, first)",
+        f"{ONE_JOINT}[105 bounces]",
+    ),
+    "an upper stop does not push": Mutant(
+        "simulation/holding.py",
+        "least = jnp.where(held_as == UPPER, -jnp.inf, -toward(static, 1))",
+        "least = -toward(static, 1)",
+        f"{ONE_JOINT}[a blow without restitution, and a rest]",
+    ),
+    "directions of friction are exchanged": Mutant(
+        "forces/holders.py",
+        "return jnp.where(jnp.asarray(direction) > 0, *friction)",
+        "return jnp.where(jnp.asarray(direction) < 0, *friction)",
+        f"{HOLDING}::test_friction_has_a_level_in_each_direction",
+    ),
+    "static friction may be below the level": Mutant(
+        "forces/holders.py",
+        "level = jnp.where(static < level, jnp.nan, level)",
+        "pass",
+        f"{HOLDING}::test_friction_that_becomes_what_it_cannot_be_ends_a_motion[0.5]",
+    ),
+    "prescribed efforts carry no weight": Mutant(
+        "simulation/prescribed.py",
+        "return jnp.where(moved, matrix @ qdd + bias - tau, 0)",
+        "return jnp.where(moved, matrix @ qdd - tau, 0)",
+        f"{MASSES}::test_a_motor_lifts_the_mass_of_the_time",
+    ),
+    "bearings carry no weight of a payload": Mutant(
+        "forces/payload.py",
+        "force = -self.mass * (plane_vector(x, y) + 1j * linkage.gravity)",
+        "force = -self.mass * plane_vector(x, y)",
+        f"{MASSES}::test_bearings_carry_the_mass_of_the_time",
     ),
     # Controllers on a clock
     "modes after efforts of before": Mutant(
@@ -384,8 +424,7 @@ MUTANTS = {
         "steps/events.py",
         "passed = passage(*constant(at))",
         "passed = passage(*at)",
-        "tests/test_friction_levels.py"
-        "::test_a_later_slip_has_a_time_with_derivatives_in_what_a_function_holds",
+        f"{HOLDING}::test_a_dragged_slide_sticks_and_slips_as_scipy_has_it",
     ),
     "a run ends where its last step does": Mutant(
         "steps/events.py",

@@ -10,7 +10,6 @@ import fdof_jax as fj
 from fdof_jax.steps.switch_derivatives import of_zero
 
 BAR = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[1 / 12])
-SLIDE = fj.Linkage("P", length=[0, 0], com=[[0, 0]], mass=[1], inertia=[1], gravity=0)
 TURNS = jnp.array([1.2, 1.0])
 
 
@@ -57,15 +56,3 @@ def test_ends_that_only_the_condition_moves(mode):
     speed = lambda turn: jnp.sqrt(3 * BAR.gravity * jnp.sin(turn))
     exact = jnp.diag(jax.grad(lambda turn: jnp.sum(1 / speed(turn)))(TURNS))
     np.testing.assert_allclose(second(times)(TURNS), exact, atol=1e-10)
-
-
-@pytest.mark.slow
-def test_places_where_friction_stops_a_slide():
-    def places(level):
-        start = fj.State([0.0], [3.0])
-        rubs = lambda level: (fj.forces.JointFriction(level),)
-        stops = lambda level: fj.simulate(SLIDE, start, [0, 9.0], rubs(level)).q[-1, 0]
-        return jnp.sum(jax.vmap(stops)(level))
-
-    exact = jnp.diag(9 / TURNS**3)  # of v^2 / (2 level)
-    np.testing.assert_allclose(jax.hessian(places)(TURNS), exact, rtol=1e-9)

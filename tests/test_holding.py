@@ -1,255 +1,422 @@
-"""Joints that are held for a while: laws, modes, events, batches."""
+"""Joints that are held for a while: closed forms, laws, roundings and derivatives.
+
+Scenes are data: those of one joint, and those of five, share a program each.
+"""
 
 import diffrax
+import held_scenes as held
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pandas
 import pytest
-from elements import SHORT, START, arm
-from held_scenes import derivative_errors, law_errors, reverse
-from modes import LOOPS, hessian
+from held_scenes import LATER, NEVER, Held, Row
+from modes import hessian, jacobian
+from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 import fdof_jax as fj
-from fdof_jax.forces import Brake, HardStops, JointFriction, Payload
+from fdof_jax.forces import Brake, HardStops, JointFriction, Payload, stribeck
 
-inf = np.inf
-BAR = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[1 / 12])
+inf, G = np.inf, 9.81
+FORWARD = dict(adjoint=diffrax.ForwardMode())
 SLIDE = fj.Linkage("P", length=[0, 1], com=[[0, 0]], mass=[1], inertia=[1], gravity=0.0)
+DROP = SLIDE.replace(gravity=G)
+BAR = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[1 / 12])
+WHEEL = BAR.replace(gravity=0.0)
+LOAD = G / 2  # of the bar, level
 REST = fj.State([0.0], [0.0])
-LOAD = 9.81 * 0.5  # of the bar, level
-NEVER = Brake(1, 9.0)  # after all motions that have it
 
 
-def run(linkage, state0, ts, *forces, **options):
-    return fj.simulate(linkage, state0, ts, forces, **options)
+def one_joint(
+    linkage, q=0.0, qd=0.0, *, level=0.0, static=None, stops=(-inf, inf),
+    restitution=0.0, brake=(NEVER, LATER), load=0.0, carried=(NEVER, LATER),
+    gains=(0.0, 0.0), limit=inf, target=(0.0, 0.0, NEVER), effort=0.0,
+):  # fmt: skip
+    """Returns a scene with all elements, most of which do nothing."""
+    *places, step = target
+    target = fj.references.Step(*places, begin=step)
+    forces = (
+        JointFriction(level, static=level if static is None else static),
+        HardStops(*stops, restitution=restitution),
+        Brake(1, *brake),
+        Payload(fj.Point(1, 1.0), load, begin=carried[0], end=carried[1]),
+        fj.PDController(*gains, limit, target),
+        fj.JointEffort(effort),
+    )
+    start = fj.State(jnp.reshape(q, 1), jnp.reshape(qd, 1))
+    return jax.tree.map(jnp.asarray, fj.Scene(linkage, start, forces, 0.0))
 
 
-# Friction
+def hits(height, restitution, count):
+    """Returns the times at which a ball hits the floor."""
+    flights = restitution ** jnp.arange(1, count)
+    fall = jnp.sqrt(2 * height / G)
+    return fall * (1 + 2 * jnp.concatenate([jnp.zeros(1), jnp.cumsum(flights)]))
 
 
-def test_friction_above_the_load_holds_to_the_last_bit():
-    friction = JointFriction(1.5 * LOAD, static=1.5 * LOAD)
-    motion = run(BAR, REST, [0, 5, 10.0], friction)
-    np.testing.assert_array_equal(motion.q, 0)
-    np.testing.assert_array_equal(motion.modes, 1)
-    assert motion.events.count == 0
+def ball(height, restitution):
+    return one_joint(DROP, height, stops=(0.0, inf), restitution=restitution)
+
+
+def bounced(height, restitution, count):
+    """Returns a row that ends after so many bounces."""
+    last, before = hits(height, restitution, count + 1)[jnp.array([-1, -2])]
+    t = 0.7 * float(before) + 0.3 * float(last)
+
+    def exact(height, restitution):
+        times, left = hits(height, restitution, count), restitution**count
+        since, qd = t - times[-1], left * jnp.sqrt(2 * height * G)
+        of_last = dict(q=[qd * since - G * since**2 / 2], qd=[qd - G * since])
+        taken = G * height * (1 - left**2)
+        return of_last | dict(taken=[taken], t=times[-64:])
+
+    return Row(ball, (height, restitution), [0, t], exact)
+
+
+def rests(height, e):
+    """Infinitely many bounces last a finite time."""
+    end = jnp.sqrt(2 * height / G) * (1 + e) / (1 - e)
+    return dict(last=end, q=[0.0], modes=[2.0], taken=[G * height])
+
+
+RUBS = lambda rate, load: one_joint(SLIDE, 0.0, rate, level=1, static=2, effort=load)
+THROWN = lambda q, floor, qd: one_joint(DROP, q, qd, stops=(floor, inf))
+DIFFERENTIABLE = {
+    "friction holds its load": Row(
+        lambda level: one_joint(BAR, level=level), (1.5 * LOAD,), [0, 10.0],
+        lambda level: dict(q=[0.0], qd=[0.0], modes=[1.0], taken=[0.0]), [],
+    ),
+    "a rate that counts as zero is held": Row(
+        RUBS, (1e-14, 1.5), [0, 2.0], lambda *_: dict(q=[0.0], qd=[0.0])
+    ),
+    "a rate that counts as zero slides off": Row(
+        RUBS, (1e-14, 2.5), [0, 2.0],
+        lambda rate, load: dict(q=[2 * rate + 2 * load - 2], qd=[rate + 2 * load - 2]),
+    ),
+    "a start on a stop that is left": Row(
+        THROWN, (0.2, 0.2, 2.0), [0, 0.3],
+        lambda q, floor, qd: dict(q=[q + 0.3 * qd - G * 0.3**2 / 2]),
+    ),
+    "a ball bounces to rest": Row(ball, (1.0, 0.5), [0, 2.0], rests),
+    "21 elastic bounces": bounced(10.0, 1.0, 21),
+    "105 bounces": bounced(10.0, 0.99, 105),
+    "a brake for a while": Row(
+        lambda qd, *brake: one_joint(SLIDE, 0.0, qd, brake=brake, effort=2.0),
+        (0.5, 0.4, 2.0), [0, 3.0],
+        lambda qd, t, end: dict(
+            q=[qd * t + t**2 + (3 - end) ** 2], qd=[6 - 2 * end],
+            taken=[(qd + 2 * t) ** 2 / 2],
+        ), ["is braked", "is let go"],
+    ),
+    "a payload for a while": Row(
+        lambda load, *at: one_joint(WHEEL, 0.0, 2.0, load=load, carried=at),
+        (1.5, 0.4, 0.8), [0, 1.0],
+        lambda m, t, _: dict(  # to let it go changes no rate
+            q=[2 * t + 2 / (1 + 3 * m) * (1 - t)], qd=[2 / (1 + 3 * m)],
+            taken=[2 / 3 - 2 / 3 / (1 + 3 * m)],
+        ),
+    ),
+}  # fmt: skip
+
+
+BLOW = dict(stops=(-inf, 1.0), target=(-1.0, -1.0, NEVER), effort=0.1)
+ROWS = DIFFERENTIABLE | {
+    "static friction holds what has come to rest": Row(
+        lambda: one_joint(BAR, level=0.9 * LOAD, static=1.1 * LOAD), (), [0, 1.0],
+        lambda: dict(q=[0.0]), [],
+    ),
+    "an elastic ball that is laid down": Row(
+        lambda: ball(0.0, 1.0), (), [0, 0.5], lambda: dict(q=[0.0], modes=[2.0]), []
+    ),
+    "an elastic ball that drops by nothing": Row(
+        lambda: ball(1e-12, 1.0), (), [0, 0.5, 1.0],
+        lambda: dict(q=[0.0, 0.0], modes=[2.0, 2.0]),
+    ),
+    # A step that is tried from a bounce on may reach a kilometre below the floor.
+    "30 nearly elastic bounces": bounced(10.0, 1 - 1e-12, 30),
+    "the last bounces are brief beside the whole time": Row(
+        ball, (0.1, 0.97), [0, 1000.0], rests
+    ),
+    "a blow without restitution, and a rest": Row(
+        lambda: one_joint(SLIDE, 0.0, 9.0, **BLOW), (), [0, 0.3],
+        events=["rests on its stop"],
+    ),
+    "a blow without restitution, and a pull away": Row(
+        lambda: one_joint(SLIDE, 0.0, 9.0, gains=(9.0, 0.0), **BLOW), (), [0, 0.3],
+        events=["is stopped"],
+    ),
+    "a brake that acts already": Row(
+        lambda: one_joint(SLIDE, 0.0, 2.0, brake=(-1.0, LATER)), (), [0, 0.5],
+        lambda: dict(q=[0.0], modes=[4.0], taken=[2.0]), ["is braked"],
+    ),
+    "a brake that acts already on a joint at rest": Row(
+        lambda: one_joint(SLIDE, brake=(0.0, LATER)), (), [0, 0.5],
+        lambda: dict(q=[0.0], modes=[4.0], taken=[0.0]), [],
+    ),
+    "a brake that lets go at a stop": Row(
+        lambda: one_joint(BAR, stops=(-0.5, 0.5), brake=(1.0, 1.5)), (),
+        [0, 0.9, 1.2, 2.0],
+        lambda: dict(q=[-0.5] * 3, modes=[2.0, 4.0, 2.0]),
+        ["rests on its stop", "is braked", "rests on its stop"],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_one_joint_moves_as_closed_forms_say(name):
+    held.check_motion(ROWS[name], name)
 
 
 @pytest.mark.slow
-def test_static_friction_holds_what_has_come_to_rest_only():
-    """It is above the load, which sliding friction is not: at rest the bar stays."""
-    friction = JointFriction(0.9 * LOAD, static=1.1 * LOAD)
-    assert run(BAR, REST, [0, 1.0], friction).q[-1, 0] == 0
-    falling = run(BAR, fj.State([0.0], [-0.1]), [0, 0.1], friction)
-    assert falling.q[-1, 0] < -0.01
+def test_a_batch_has_the_derivatives_of_closed_forms():
+    held.check_derivatives(DIFFERENTIABLE)
 
 
-@pytest.mark.slow
-def test_a_sprung_slide_stops_short_and_derivatives_tell_where():
-    """13 half swings, each shorter by 4 cm; forward mode is in docs/held.py."""
-    ts, spring = np.linspace(0, 6, 7), fj.forces.JointSpring(100.0)
-
-    def end(numbers):
-        start, level = numbers
-        state0 = fj.State(jnp.stack([start]), jnp.zeros(1))
-        motion = run(SLIDE, state0, ts, JointFriction(level), spring)
-        return motion.q[-1, 0], motion.events.t[0]
-
-    numbers = jnp.array([0.51, 2.0])
-    ends = lambda numbers: (jnp.stack(end(numbers)),) * 2
-    reverse = jax.jit(jax.jacrev(ends, has_aux=True), **LOOPS)
-    slopes, (x, t) = reverse(numbers)
-    np.testing.assert_allclose([x, t], [0.01, 1.3 * np.pi], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(slopes, [[-1, 0.26], [0, 0]], atol=1e-8)
-
-
-@pytest.mark.slow
 def test_tiny_arms_stick_slip_and_saturate_as_large_ones():
     """Efforts of 1e-12 N m, or of 1e12, are found as exactly as those of 1 N m."""
-    ts = np.linspace(0, 1.5, 16)
 
-    def motion(size):
-        bar = BAR.replace(mass=[size], inertia=[size / 12])
-        target = fj.references.Step(-1.3, 0.4, begin=0.2)
-        pd = fj.PDController(60 * size, 8 * size, 8 * size, target)
-        friction = JointFriction(0.8 * size, static=2 * size)
-        return run(bar, fj.State([-1.3], [0.0]), ts, friction, pd)
+    def motion(linkage, q=0.0, effort=1.0, size=1.0):
+        masses = {k: effort * vars(linkage)[k] for k in ("mass", "inertia")}
+        scene = one_joint(
+            linkage.replace(**masses), q, level=0.8 * effort * size,
+            static=2 * effort * size, gains=(60 * effort, 8 * effort),
+            limit=8 * effort * size, target=(q, 0.4 * size, 0.2),
+        )  # fmt: skip
+        tolerances = dict(rtol=1e-11, atol=1e-11 * size)
+        return fj.simulate(scene, np.linspace(0, 1.5, 16), **tolerances)
 
-    wanted = motion(1.0)
+    wanted = motion(BAR, -1.3)
     assert wanted.stats["num_switches"] > 2 and wanted.events.count == 2
-    for size in (1e-12, 1e12):
-        found = motion(size)
+    for effort in (1e-12, 1e12):
+        found = motion(BAR, -1.3, effort)
         np.testing.assert_allclose(found.q, wanted.q, atol=1e-9)
         np.testing.assert_allclose(found.events.t, wanted.events.t, atol=1e-9)
-
-    def way(size):
-        target = fj.references.Step(0.0, 0.4 * size, begin=0.2)
-        pd = fj.PDController(60.0, 8.0, 8 * size, target)
-        friction = JointFriction(0.8 * size, static=2 * size)
-        tolerances = dict(rtol=1e-11, atol=1e-11 * size)
-        return run(SLIDE, REST, ts, friction, pd, **tolerances).q / size
-
     # Rates of friction have no unit of their own.
-    np.testing.assert_allclose(way(1e-6), way(1.0), atol=1e-7)
+    short, whole = motion(SLIDE, size=1e-6), motion(SLIDE)
+    np.testing.assert_allclose(short.q / 1e-6, whole.q, atol=1e-7)
 
 
 @pytest.mark.slow
 def test_a_kink_where_friction_turns_leaves_derivatives_on_both_sides():
     """The limit of a motor has kinks at rest, where the friction jumps."""
     pd = fj.PDController(60.0, 2.0, 20.0, fj.references.SetPoint([-0.5]))
-    motor = fj.control.SpeedLimit(pd, 20.0, 15.0)
-    motion = run(BAR, fj.State([0.3], [0.7]), [0, 1.5], motor, JointFriction(0.3))
+    forces = fj.control.SpeedLimit(pd, 20.0, 15.0), JointFriction(0.3)
+    motion = fj.simulate(BAR, fj.State([0.3], [0.7]), [0, 1.5], forces)
     assert motion.stats["num_switches"] > 6 and motion.stats["one_sided"] == 0
 
 
-@pytest.mark.slow
-def test_a_mass_on_a_belt_sticks_and_slips_for_a_hundred_periods():
-    """As seen from the belt, the spring's other end moves."""
-    pull = lambda t, q, qd, linkage: -100 * (q + 0.1 * t)
-    period = 0.2 + 0.47123889803846897
-    ts = np.linspace(0, 100 * period, 11)
-    motion = run(SLIDE, REST, ts, JointFriction(2.0, static=3.0), pull)
-    t, kind = np.asarray(motion.events.t), np.asarray(motion.events.kind)
-    assert motion.events.count == 199 and len(t) == 64
-    np.testing.assert_allclose(t[2:] - t[:-2], period, rtol=0, atol=1e-10)
-    sticks = np.diff(t)[kind[:-1] == 0]  # until it slips
-    np.testing.assert_allclose(sticks, 0.2, rtol=0, atol=1e-10)
-
-
-# Stops
-
-
-def test_a_mass_bounces_to_rest_at_a_known_time():
-    """The times of endlessly many bounces add up to it."""
-    drop = SLIDE.replace(gravity=9.81)
-    floor = HardStops(0.0, inf, restitution=0.5)
-
-    def rests(height, **options):
-        start = fj.State(jnp.stack([height]), jnp.zeros(1))
-        motion = run(drop, start, [0, 2.0], floor, **options)
-        last = motion.events.count.astype(int) - 1
-        return motion.events.t[last], motion
-
-    forward = lambda h: rests(h, adjoint=diffrax.ForwardMode())
-    slope, motion = jax.jit(jax.jacfwd(forward, has_aux=True), **LOOPS)(1.0)
-    time, _ = rests(jnp.array(1.0))
-    np.testing.assert_allclose(time, 1.3545709229571927, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(slope, 0.6772854614785964, rtol=0, atol=1e-9)
-    assert motion.q[-1, 0] == 0 and motion.modes[-1, 0] == 2
-    effort = fj.joint_efforts(drop, (floor,), motion).total[-1, 0]
-    np.testing.assert_allclose(effort, 9.81, rtol=1e-15)
-    np.testing.assert_allclose(motion.taken[-1], 9.81, rtol=1e-9)
-
-
-@pytest.mark.slow
-def test_second_derivatives_through_a_blow():
-    drop = SLIDE.replace(gravity=9.81)
-
-    def height(numbers):
-        start, restitution = numbers
-        state0 = fj.State(jnp.stack([start]), jnp.zeros(1))
-        floor = HardStops(0.0, inf, restitution=restitution)
-        forward = diffrax.ForwardMode()
-        return run(drop, state0, [0, 0.6], floor, adjoint=forward).q[-1, 0]
-
-    def closed_form(numbers):
-        start, restitution = numbers
-        hit = jnp.sqrt(2 * start / 9.81)
-        left = 0.6 - hit
-        return 9.81 * left * (restitution * hit - left / 2)
-
-    at = jnp.array([1, 0.5])
-    curves, *_ = hessian(height)(at)
-    exact = jax.hessian(closed_form)(at)
-    np.testing.assert_allclose(curves, exact, rtol=0, atol=1e-8)
-
-
-@pytest.mark.slow
-def test_a_start_on_a_stop_that_is_left_has_its_own_derivatives():
-    drop = SLIDE.replace(gravity=9.81)
-
-    def thrown(numbers):
-        start, floor, rate = numbers
-        state0 = fj.State(start[None], rate[None])
-        stops = HardStops(floor, inf)
-        return run(drop, state0, [0, 0.3], stops, adjoint=diffrax.ForwardMode()).q[
-            -1, 0
-        ]
-
-    slopes = jax.jit(jax.jacfwd(thrown), **LOOPS)(jnp.array([0.2, 0.2, 2.0]))
-    np.testing.assert_allclose(slopes, [1, 0, 0.3], rtol=0, atol=1e-11)
-
-
-def stopped(linkage, start, ts, stops, *, brake=NEVER, stiffness=0.0, effort=0.0):
-    """Returns a motion between stops; what does not act lets all share a program."""
-    spring = fj.forces.JointSpring(stiffness, rest=-1.0)
-    return run(linkage, start, ts, stops, brake, spring, fj.JointEffort(effort))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "stiffness, event", [(0.0, "rests on its stop"), (9.0, "is stopped")]
-)
-def test_a_blow_without_restitution_is_no_bounce(stiffness, event):
-    """A spring pulls the slide away from the stop at once, or nothing does."""
-    start = fj.State([0.0], [9.0])
-    motion = stopped(
-        SLIDE, start, [0, 0.3], HardStops(-inf, 1.0), stiffness=stiffness, effort=0.1
-    )
-    assert motion.events.table["event"].tolist() == [event]
-    assert motion.qd[-1, 0] <= 0
-
-
 def test_a_start_outside_of_stops_is_refused():
-    stops = HardStops(-1.0, 1.0)
+    scene = one_joint(BAR, 1.5, stops=(-1.0, 1.0))
     with pytest.raises(ValueError, match="^state0.q: expected .* between the hard"):
-        run(BAR, fj.State([1.5], [0.0]), [0, 1.0], stops)
-    motion = run(BAR, fj.State([1.5], [0.0]), [0, 1.0], stops, throw=False)
+        fj.simulate(scene, [0, 1.0])
+    motion = fj.simulate(scene, [0, 1.0], throw=False)
     assert motion.outcome == "not finite"
     assert motion.events.count == 0 and np.isnan(motion.events.t).all()
 
 
-@pytest.mark.slow
-def test_a_fixed_pair_has_no_stops():
-    """Its position is 0, which need not lie within a range that others have."""
-    start = fj.State([0.7, 0.0], [0.0, 0.0])
-    stops = HardStops(0.5, 1.0, restitution=0.5)
-    linkage = PAIR.replace(topology="RF", gravity=9.81)
-    motion = run(linkage, start, [0, 1.0], stops, NEVER)
-    assert motion.outcome == "successful" and 0.5 <= motion.q[-1, 0] <= 0.7
-
-
-# Brakes and payloads
-
-PAIR = fj.Linkage(
-    "RR", length=[0, 1, 1], com=[[0.5, 0]] * 2, mass=[1, 1], inertia=[1 / 12] * 2,
-    gravity=0.0,
-)  # fmt: skip
-MOVING = fj.State([0.3, 0.8], [1.0, 2.0])
-ANYWHERE = HardStops(-inf, inf, restitution=0.5)  # for one program
+def test_reactions_count_a_payload_while_it_is_there():
+    scene = one_joint(BAR, level=100.0, load=2.0, carried=(0.2, 0.6))
+    reactions = fj.joint_reactions(scene, fj.simulate(scene, [0, 0.4, 1.0]))
+    right = [[0, G * m, G * (0.5 + m - 1)] for m in (1, 3, 1)]
+    np.testing.assert_allclose(reactions[:, 0], right, atol=1e-12)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("begin", [-1.0, 0.0])
-def test_a_brake_that_acts_already_holds_from_the_start(begin):
-    motion = run(PAIR, MOVING, [0, 1.0], ANYWHERE, Brake(2, begin))
-    expected = [1.5768759984566454, 0]
-    np.testing.assert_allclose(motion.qd, [expected] * 2, rtol=1e-12)
-    energy = fj.energy(PAIR, *MOVING)[0]
-    np.testing.assert_allclose(
-        fj.energy(PAIR, motion.q[-1], motion.qd[-1])[0] + motion.taken,
-        energy,
-        rtol=1e-9,
+def test_second_derivatives_of_slides_that_bounce_off_a_stop_and_come_to_rest():
+    """In a batch, in the restitution that all share and in the friction of each."""
+
+    def ends(numbers):
+        restitution, *levels = numbers
+        stops = HardStops(-inf, 1.0, restitution=restitution)
+
+        def end(level):
+            forces, start = (JointFriction(level), stops), fj.State([0.0], [3.0])
+            return fj.simulate(SLIDE, start, [0, 9.0], forces, **FORWARD).q[-1, 0]
+
+        return jax.vmap(end)(jnp.stack(levels))
+
+    def exact(numbers):
+        restitution, levels = numbers[0], numbers[1:]
+        return 1 - restitution**2 * (9 - 2 * levels) / (2 * levels)
+
+    at = jnp.array([0.5, 1.2, 1.0])
+    curves, slopes, places = hessian(ends)(at)
+    np.testing.assert_allclose(places, exact(at), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(slopes, jax.jacfwd(exact)(at), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(curves, jax.hessian(exact)(at), rtol=0, atol=1e-8)
+
+
+# Friction of two directions, and of functions
+
+
+BLOCK = SLIDE.replace(gravity=G, base_angle=0.3 - np.pi / 2)  # on a slope of 0.3 rad
+WEIGHT = G * np.sin(0.3)
+
+
+@pytest.mark.slow
+def test_friction_has_a_level_in_each_direction():
+    """A block goes up against 4 N, turns, and comes down against 1 N."""
+
+    def slid(linkage, qd, up, down, effort=0.0):
+        forces = JointFriction([[up], [down]]), fj.JointEffort(effort)
+        motion = fj.simulate(linkage, fj.State([0.0], [qd]), [0, 0.1, 1.0], forces)
+        return forces, motion
+
+    v, up, down = 2.0, 4.0, 1.0
+    forces, motion = slid(BLOCK, v, up, down)
+    top, height = v / (WEIGHT + up), v**2 / 2 / (WEIGHT + up)
+    q = [0, v * 0.1 - (WEIGHT + up) * 0.1**2 / 2]
+    q += [height - (WEIGHT - down) * (1 - top) ** 2 / 2]
+    np.testing.assert_allclose(motion.q[:, 0], q, rtol=0, atol=1e-9)
+    taken = [0, up * q[1], up * height + down * (height - q[2])]
+    np.testing.assert_allclose(motion.taken, taken, rtol=0, atol=1e-9)
+    effort = fj.joint_efforts(BLOCK, forces, motion).total[:, 0]
+    np.testing.assert_allclose(effort, [-up, -up, down], rtol=0, atol=1e-12)
+    # Held on the way down, and taken along by a push uphill of the same size; without
+    # friction uphill, a push is held by none.
+    for case, end in (
+        ((BLOCK, 0.0, 1.0, WEIGHT + 0.1), 0.0),
+        ((BLOCK, 0.0, 1.0, WEIGHT + 0.1, 2 * WEIGHT), (WEIGHT - 1) / 2),
+        ((SLIDE, 0.0, 0.0, 3.0, 1.0), 0.5),
+        ((SLIDE, 0.0, 3.0, 0.0, 1.0), 0.0),
+    ):
+        np.testing.assert_allclose(slid(*case)[1].q[-1, 0], end, rtol=0, atol=1e-9)
+
+
+def scipy_times(coulomb, static, speed, stiffness, pace, end):
+    """Returns the times at which a dragged slide slips and sticks, in turn."""
+
+    def rates(t, y):
+        fall = (static - coulomb) * np.exp(-((y[1] / speed) ** 2))
+        return y[1], stiffness * (pace * t - y[0]) - coulomb - fall
+
+    rests = lambda t, y: y[1]
+    rests.terminal, rests.direction = True, -1
+    x, times = 0.0, []
+    while (slips := (x + static / stiffness) / pace) < end:
+        found = solve_ivp(
+            rates, (slips, slips + 2), (x, 0.0), "DOP853", events=rests,
+            rtol=1e-12, atol=1e-14, first_step=1e-6,
+        )  # fmt: skip
+        x = found.y_events[0][0][0]
+        times += [slips, found.t_events[0][0]]
+    return np.array(times)
+
+
+@pytest.mark.slow
+def test_a_dragged_slide_sticks_and_slips_as_scipy_has_it():
+    """Its derivatives are differences; a held slide at q slips at a known time."""
+
+    def dragged(numbers):
+        *friction, stiffness, pace = numbers
+        drag = lambda t, q, qd, linkage: stiffness * (pace * t - q)
+        forces, ts = (JointFriction(stribeck(*friction)), drag), [0, 0.9, 7.5]
+        options = dict(rtol=1e-12, atol=1e-12, **FORWARD)
+        motion = fj.simulate(SLIDE, REST, ts, forces, **options)
+        return motion.events.t, motion.q[1:, 0], motion.taken[-1]
+
+    numbers = np.array([2.0, 3.0, 0.05, 100.0, 0.1])
+    _, static, _, stiffness, pace = numbers
+    both = jacobian(dragged)
+    (of_times, of_places, _), (times, places, taken) = both(numbers)
+    right = scipy_times(*numbers, 7.5)
+    assert len(right) == np.isfinite(times).sum() == 20
+    np.testing.assert_allclose(times[:20], right, rtol=0, atol=1e-9)
+    assert taken < 1e-20  # functions are not counted
+    np.testing.assert_allclose(times[2], (places[0] + static / stiffness) / pace)
+    wanted = of_places[0] + [0, 1 / stiffness, 0, -static / stiffness**2, -times[2]]
+    np.testing.assert_allclose(of_times[2], wanted / pace, rtol=1e-8)
+    for k, step in enumerate(1e-5 * numbers * np.eye(5)):
+        after, before = (both(numbers + sign * step)[1] for sign in (1, -1))
+        for slopes, *ends in zip((of_times[:2], of_places), after, before):
+            wanted = np.subtract(*(end[:2] for end in ends)) / (2 * step[k])
+            np.testing.assert_allclose(slopes[:, k], wanted, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("change", [-2.0, 0.5])
+def test_friction_that_becomes_what_it_cannot_be_ends_a_motion(change):
+    """Negative, or above the static friction."""
+    friction = JointFriction(lambda t, q, qd, linkage: 1 + change * t, static=1.2)
+    start = fj.State([0.0], [9.0])
+    motion = fj.simulate(SLIDE, start, [0, 1.0], (friction,), throw=False)
+    assert motion.outcome == "not finite"
+    assert 0.15 < motion.stats["time_reached"] < 0.51
+
+
+def test_friction_of_a_function_is_written_to_files(tmp_path):
+    friction = JointFriction(stribeck([2.0], 3.0, 0.1), static=[[4.0], [5.0]])
+    fj.save(tmp_path / "friction.json", friction)
+    assert repr(fj.load(tmp_path / "friction.json")) == repr(friction)
+
+
+@pytest.mark.slow
+def test_states_of_drives_go_on_while_a_brake_holds():
+    """An integral and the lags of a controller and of a force, by exponentials."""
+    kp, ki, kd, lag, goal = 40.0, 30.0, 12.0, 0.05, 0.5
+    pid = fj.control.PIDController(kp, ki, kd, inf, fj.references.SetPoint([goal]))
+    lagged = fj.control.FirstOrderLag
+    drives = lagged(pid, lag), lagged(fj.JointEffort(3.0), lag)
+    # By position, rate, integral, both lags and 1
+    moving = np.zeros((6, 6))
+    moving[0, 1], moving[1, 3:5], moving[2, [0, 5]] = 1, 1, [-ki, ki * goal]
+    moving[3, [0, 1, 2, 3, 5]] = np.array([-kp, -kd, 1, -1, kp * goal]) / lag
+    moving[4, [4, 5]] = np.array([-1, 3]) / lag
+    braked = moving * [[0], [0], [1], [1], [1], [1]]
+    end = expm(0.4 * moving) @ [0.2, 0.3, 0, 0, 0, 1]
+    end = expm(0.1 * braked) @ np.diag([1, 0, 1, 1, 1, 1]) @ end
+    *end, _ = expm(0.3 * moving) @ end
+    forces = *drives, Brake(1, 0.4, 0.5)
+    motion = fj.simulate(SLIDE, fj.State([0.2], [0.3]), [0, 0.8], forces)
+    own = [leaf[-1, 0] for leaf in jax.tree.leaves(motion.own)]
+    np.testing.assert_allclose([motion.q[-1, 0], motion.qd[-1, 0]], end[:2], atol=1e-9)
+    np.testing.assert_allclose(np.sort(own), np.sort(end[2:]), atol=1e-8)
+
+
+# Several joints: all of these arms have five, by the program of random scenes
+
+
+def whole(row, rest=0.0):
+    return np.append(np.asarray(row, float), np.full(5 - len(row), rest))
+
+
+def several(
+    topology, q, qd, *, load=0.0, level=0.0, static=None, stops=(-inf, inf),
+    restitution=0.0, brake=(1, NEVER, LATER), carried=0.0, taken=NEVER, **links,
+):  # fmt: skip
+    """Returns a scene; fixed pairs without mass complete the arm."""
+    n = len(topology)
+    static = level if static is None else static
+    of_links = dict(length=[0] + [1] * n, com=[[0.5, 0]] * n, mass=[1] * n)
+    links = of_links | dict(inertia=[1 / 12] * n, locked=[0] * n, gravity=0.0) | links
+    com = np.concatenate([links["com"], np.zeros((5 - n, 2))])
+    links |= {k: whole(links[k]) for k in ("mass", "inertia", "locked")}
+    links |= dict(com=com, length=np.append(links["length"], np.zeros(5 - n)))
+    each = lambda x, rest=0.0: whole(np.broadcast_to(np.asarray(x, float), n), rest)
+    forces = (
+        # Of a load, so soft and so far from its rest that its effort is constant.
+        fj.forces.JointSpring(whole([1e-6 * bool(load)]), rest=1e6 * load),
+        JointFriction(each(level), static=each(static)),
+        HardStops(
+            each(stops[0], -inf), each(stops[1], inf), restitution=each(restitution)
+        ),
+        Brake(*brake),
+        Payload(fj.Point(n), carried, 0.0, begin=taken, velocity=[0.0, 0.0]),
     )
+    arm = fj.Linkage(topology + "F" * (5 - n), **links)
+    return Held(arm, fj.State(jnp.asarray(whole(q)), jnp.asarray(whole(qd))), forces)
+
+
+def run(scene, ts):
+    return fj.simulate(scene.linkage, scene.state0, ts, scene.forces)
 
 
 @pytest.mark.slow
 def test_a_brake_holds_to_the_last_bit():
     """The compensated sum carries rounding errors of the steps before."""
     for begin in np.linspace(0.25, 0.75, 11):
-        motion = run(PAIR, MOVING, np.linspace(0, 1, 41), ANYWHERE, Brake(2, begin))
+        scene = several("RR", [0.3, 0.8], [1.0, 2.0], brake=(2, begin, LATER))
+        motion = run(scene, np.linspace(0, 1, 41))
         # In NumPy, as in JAX each number of rows is another program.
         ts, q, qd = map(np.asarray, (motion.ts, motion.q, motion.qd))
         np.testing.assert_array_equal(qd[ts > begin, 1], 0)
@@ -257,162 +424,84 @@ def test_a_brake_holds_to_the_last_bit():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("lagged", ["the controller", "a force beside it"])
-def test_states_of_drives_go_on_while_a_brake_holds(lagged):
-    """The integral and the lag of a slide, by matrix exponentials."""
-    kp, ki, kd, lag, goal = 40.0, 30.0, 12.0, 0.05, 0.5
-    pid = fj.control.PIDController(kp, ki, kd, inf, fj.references.SetPoint([goal]))
-    within = lagged == "the controller"
-    effort = [-kp, -kd, 1, 0, kp * goal]  # by position, rate, integral, lag and 1
-    behind, whole = (effort, [0, 0, 0, 1, 0]) if within else ([0, 0, 0, 0, 3], effort)
-    moving = np.zeros((5, 5))
-    moving[0, 1], moving[1] = 1, np.add(whole, [0, 0, 0, not within, 0])
-    moving[2, [0, 4]], moving[3] = [-ki, ki * goal], behind
-    moving[3] = (moving[3] - np.eye(5)[3]) / lag
-    held = moving * [[0], [0], [1], [1], [1]]
-    stopped = np.diag([1, 0, 1, 1, 1])
-    end = expm(0.4 * moving) @ [0.2, 0.3, 0, 0, 1]
-    end = expm(0.3 * moving) @ expm(0.1 * held) @ stopped @ end
-    lag_of = fj.control.FirstOrderLag
-    drives = (lag_of(pid, lag),) if within else (pid, lag_of(fj.JointEffort(3.0), lag))
-    motion = run(SLIDE, fj.State([0.2], [0.3]), [0, 0.8], *drives, Brake(1, 0.4, 0.5))
-    own = [leaf[-1, 0] for leaf in jax.tree.leaves(motion.own)]
-    np.testing.assert_allclose(motion.q[-1, 0], end[0], atol=1e-9)
-    np.testing.assert_allclose(motion.qd[-1, 0], end[1], atol=1e-9)
-    np.testing.assert_allclose(np.sort(own), np.sort(end[2:4]), atol=1e-8)
+def test_a_fixed_pair_has_no_stops():
+    """Its position is 0, which need not lie within a range that others have."""
+    options = dict(stops=([0.5, 0.5], [1.0, 1.0]), restitution=0.5, gravity=G)
+    motion = run(several("RF", [0.7, 0.0], [0.0, 0.0], **options), [0, 1.0])
+    assert 0.5 <= motion.q[-1, 0] <= 0.7
 
 
 @pytest.mark.slow
-def test_a_brake_that_lets_go_at_a_stop_leaves_the_joint_there():
-    stops = HardStops(-0.5, 0.5)
-    motion = stopped(BAR, REST, [0, 0.9, 1.2, 2.0], stops, brake=Brake(1, 1.0, 1.5))
-    assert motion.modes[:, 0].tolist() == [0, 2, 4, 2]
-    assert motion.q[1:, 0].tolist() == [-0.5] * 3 and motion.events.count == 3
+def test_a_rounding_error_frees_no_joint():
+    """Inertia couples two slides by 6e-17, as pi / 2 is rounded; one rests on load."""
+
+    def crossed(angle=np.pi / 2, rate=0.0, stop=inf, load=1.5, **options):
+        return several(
+            "PP", [0.0, 0.0], [rate, 1.0], load=load, level=[1.0, 0.0],
+            static=[2.0, 0.0], stops=(-inf, [inf, stop]), restitution=0.5,
+            length=[0, 0, 0], com=[[0, 0]] * 2, inertia=[1, 1], locked=[angle, 0],
+            taken=1.0, **options,
+        )  # fmt: skip
+
+    scene = crossed()
+    assert 0 < fj.mass_matrix(scene.linkage, np.zeros(5))[0, 1] < 1e-15
+    brake = dict(brake=(2, 0.7, LATER))
+    for case in (
+        brake, dict(carried=1e-9), dict(carried=0.5), dict(stop=0.5), dict(rate=1e-17),
+        dict(rate=-1e-14),
+    ):  # fmt: skip
+        motion = run(crossed(**case), [0, 2.0])
+        assert motion.q[-1, 0] == 0 and motion.qd[-1, 0] == 0, case
+        assert (motion.modes[:, 0] == 1).all(), case
+        assert motion.events.count == sum(k in case for k in ("brake", "stop")), case
+    # What is no rounding error frees it: a rate, a load, a blow of slides that are not
+    # quite perpendicular.
+    for case, end in (
+        (dict(rate=1e-9), 2e-9 + 0.5), (dict(load=2.1), 1.1),
+        (dict(angle=np.pi / 2 - 1e-6) | brake, 0.125 * 1.3**2),
+    ):  # fmt: skip
+        motion = run(crossed(**case), [0, 2.0])
+        np.testing.assert_allclose(motion.q[-1, 0], end, rtol=1e-5)
+
+
+# Three of five joints throw each other at their stops a hundred times within 1e-3 s.
+CASCADE = dict(
+    q=[0.4127555772777217, 0.10663577576717986, 0.2294965609839984,
+       0.04362499146542287, 0.4350724237877682],
+    qd=[-0.1019495193972042, -1.9037264540263323, 2.829787525711607,
+        2.38619061070529, 2.7639893155816297],
+    stops=([-1.3650253838294104, -0.8621346523419489, -0.8407652751647515,
+            -0.6445447869409455, -0.8397591843599618],
+           [1.1158174343103087, 1.3086982603139599, 0.6632268532491,
+            0.8873668421341108, 0.9412615544639757]),
+    restitution=[0.49971664577198616, 0.7169891762068814, 0.2931325634466204,
+                 0.2772967188843861, 0.20989561789762632],
+)  # fmt: skip
 
 
 @pytest.mark.slow
-def test_reactions_count_a_payload_while_it_is_there():
-    load = Payload(fj.Point(1, 1.0), 2.0, begin=0.2, end=0.6)
-    forces = load, JointFriction(100.0)
-    motion = run(BAR, REST, [0, 0.4, 1.0], *forces)
-    reactions = fj.joint_reactions(BAR, forces, motion)
-    right = [[0, 9.81 * m, 9.81 * (0.5 + m - 1)] for m in (1, 3, 1)]
-    np.testing.assert_allclose(reactions[:, 0], right, atol=1e-12)
+def test_a_cascade_of_blows_is_no_chatter():
+    links = dict(length=[0] + [0.4] * 5, com=[[0.2, 0.02]] * 5, inertia=[0.02] * 5)
+    scene = several("RRRRR", **CASCADE, gravity=G, **links)
+    motion = run(scene, [0, 4.0])
+    energy = [sum(fj.energy(scene.linkage, motion.q[k], motion.qd[k])) for k in (0, 1)]
+    np.testing.assert_allclose(energy[0] - energy[1], motion.taken[1], atol=1e-8)
+    assert motion.events.count > 20
+
+
+# One of two slides is held, which are parallel.
+PARALLEL = several(
+    "RPP", [0.3, -0.2, 0.1], [1.0, 0.5, 0.0], brake=(2, 0.1, LATER), gravity=G,
+    length=[0, 0.3, 1.2, 0.6], com=[[0, 0.5], [0.2, 0.1], [0.4, -0.3]],
+    mass=[2.3, 1.4, 0.7], inertia=[0.3, 0.5, 0.1], locked=[0.3, -0.4, 0.5],
+    base_angle=1.3,
+)  # fmt: skip
 
 
 @pytest.mark.slow
-def test_a_payload_of_all_time_is_a_link_of_more_mass():
-    load = Payload(fj.Point(3, 0.3, 0.05), 0.7)
-    heavy = arm("RPR")
-    mass, com, inertia = 1.7, heavy.com[2], heavy.inertia[2]
-    center = (com + 0.7 * jnp.array([0.3, 0.05])) / mass
-    inertia += jnp.sum((com - center) ** 2)
-    inertia += 0.7 * jnp.sum((jnp.array([0.3, 0.05]) - center) ** 2)
-    heavy = heavy.replace(
-        mass=heavy.mass.at[2].set(mass), com=heavy.com.at[2].set(center),
-        inertia=heavy.inertia.at[2].set(inertia),
-    )  # fmt: skip
-    ts = np.linspace(0, 0.5, 6)
-    found = run(arm("RPR"), START, ts, load, **SHORT)
-    np.testing.assert_allclose(found.q, run(heavy, START, ts, **SHORT).q, atol=1e-12)
-    assert found.modes is None
-
-
-# Batches, tables, costs
-
-
-@pytest.mark.slow
-def test_a_batch_has_derivatives_in_what_its_members_share():
-    drop, heights = SLIDE.replace(gravity=9.81), jnp.array([0.4, 0.5])
-
-    def rebounds(restitution):
-        def rate(height):
-            floor = HardStops(0.0, inf, restitution=restitution)
-            start, forward = fj.State(height[None], jnp.zeros(1)), diffrax.ForwardMode()
-            return run(drop, start, [0, 0.4], floor, adjoint=forward).qd[-1, 0]
-
-        return jax.vmap(rate)(heights)
-
-    slopes = jax.jit(jax.jacfwd(rebounds), **LOOPS)(0.5)
-    np.testing.assert_allclose(slopes, jnp.sqrt(2 * 9.81 * heights), rtol=1e-9)
-
-
-@pytest.mark.slow
-def test_modes_and_topologies_share_one_program_in_a_batch():
-    """Members equal single motions."""
-    arms = [arm(topology) for topology in ("RRR", "RPR", "PRR", "RPP")]
-    batch = jax.tree.map(lambda *rows: jnp.stack(rows), *arms)
-    starts = fj.State(jnp.tile(START.q, (4, 1)), jnp.tile(START.qd, (4, 1)))
-    forces = (
-        JointFriction([2.0, 9.0, 0.5], static=[2.5, 9.5, 0.6]),
-        HardStops(-0.6, [0.6, 0.3, 0.7], restitution=0.3),
-        Brake(3, 0.3, 0.6),
-    )
-    ts = np.linspace(0, 1.5, 7)
-    single = lambda linkage, q, qd: run(linkage, fj.State(q, qd), ts, *forces)
-    swept = fj.sweep(batch, starts, ts, forces)
-    for k, linkage in enumerate(arms):
-        alone = single(linkage, START.q, START.qd)
-        np.testing.assert_allclose(swept.q[k], alone.q, atol=1e-9)
-        np.testing.assert_array_equal(swept.modes[k], alone.modes)
-        assert swept.events.count[k] == alone.events.count
-    assert len(np.unique(np.asarray(swept.modes))) == 5
-    table = pandas.DataFrame(swept.events.table)
-    assert [*table.columns] == ["motion", "t [s]", "joint", "event"]
-    assert len(table) == swept.events.count.sum()
-    frame = fj.to_pandas(arms[0], alone)
-    np.testing.assert_array_equal(frame["taken [J]"], alone.taken)
-    assert set(frame["R3 held by"]) <= {
-        "free",
-        "friction",
-        "brake",
-        "upper stop",
-        "lower stop",
-    }
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("joint", [2, 3])
-def test_an_arm_with_one_of_two_slides_held_keeps_its_energy(joint):
-    """By the program of the single motions above."""
-    linkage = fj.Linkage(
-        "RPP", length=[0, 0.3, 1.2, 0.6], com=[[0, 0.5], [0.2, 0.1], [0.4, -0.3]],
-        mass=[2.3, 1.4, 0.7], inertia=[0.3, 0.5, 0.1], locked=[0.3, -0.4, 0.5],
-        base_angle=1.3,
-    )  # fmt: skip
-    start, zeros = fj.State([0.3, -0.2, 0.1], [1.0, 0.5, 0.0]), np.zeros(3)
-    free = JointFriction(zeros, static=zeros), HardStops(-inf, zeros + inf)
-    # From the start on: the first row is after the blow.
-    motion = run(linkage, start, np.linspace(0, 1, 101), *free, Brake(joint))
-    energy = jax.vmap(lambda q, qd: sum(fj.energy(linkage, q, qd)))(motion.q, motion.qd)
-    np.testing.assert_allclose(energy[1:], energy[1], rtol=0, atol=1e-8)
-    assert np.ptp(motion.q[:, joint - 1]) == 0
-
-
-@pytest.mark.slow
-def test_blows_at_the_start_are_events():
-    arm, forces = fj.scenes.double_pendulum().linkage, (ANYWHERE, Brake(1, begin=-1))
-    motion = run(arm, fj.State([0.3, 0.0], [2.0, 1.0]), [0, 0.1], *forces)
-    assert motion.events.table["event"].tolist() == ["is braked"]
-    assert motion.qd[0, 0] == 0 and motion.taken[0] > 0
-    still = run(arm, fj.State([0.3, 0.0], [0.0, 1.0]), [0, 0.1], *forces)
-    assert still.events.count == 0
-
-
-# Laws, in scenes at random
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [4, 5, 8, 10, 12, 17, 22, 28])  # of four joints
+@pytest.mark.parametrize("seed", [None, 2, 3, 18, 26, 33])  # of five joints
 def test_laws_of_random_scenes(seed):
     """The books of energy close, held joints stand still, efforts stay in bounds."""
-    errors = law_errors(seed)
-    assert max(errors.values()) <= 1, errors
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [37, 112, 142, 243, 336, 350])  # of two joints
-def test_derivatives_in_random_scenes(seed):
-    """In reverse mode they equal extrapolated differences of tight solves."""
-    errors = derivative_errors(seed, reverse)
+    rng = np.random.default_rng(seed)
+    errors = held.law_errors(PARALLEL if seed is None else held.random_scene(rng))
     assert max(errors.values()) <= 1, errors
