@@ -99,7 +99,7 @@ def callables():
     parts = {type(part): part.arguments() for part in [ARM, *PARTS]}
     found = {}
     for room in ROOMS:
-        for name in {*room.__all__}.difference(LEFT_OUT):
+        for name in sorted({*room.__all__}.difference(LEFT_OUT)):
             if not callable(function := getattr(room, name)):
                 continue
             if found.get(name, [function])[0] is not function:
