@@ -465,7 +465,7 @@ MORE = {
     "reachable": each("reference", "reference", LINE, HELD, lambda t, linkage: None),
     "tip_errors": each("scene", "scene", BARE._replace(forces=(HELD,))),
     "step": [acting("forces: expected elements without", LAG)],
-    **{name: [acting("forces: expected elements without", e) for e in (LAG, MOVED)]
+    **{name: [acting("forces.*: expected an element without", e) for e in (LAG, MOVED)]
        for name in ("linearize", "equilibrium", "closed_loop_modes")},
     "response": [
         acting("forces: expected one controller", HELD, HELD),

@@ -327,3 +327,20 @@ def test_functions_that_return_what_cannot_be_are_named(wrong, words):
     assert motion().events.count == 1
     with pytest.raises(RuntimeError, match=words):
         motion(**wrong)
+
+
+@pytest.mark.slow
+def test_a_condition_may_close_over_what_varies_twice():
+    """A fall from h to the floor f lasts sqrt(2 (h - f) / g)."""
+
+    def time(places):
+        height, floor = places
+        start = fj.State(height[None], jnp.zeros(1))
+        ends = dict(until=lambda t, q, qd, linkage: q[0] - floor)
+        forward = diffrax.ForwardMode()
+        return fj.simulate(MASS, start, [0, 9.0], adjoint=forward, **ends).end.t
+
+    exact = lambda places: jnp.sqrt(2 * (places[0] - places[1]) / 9.81)
+    places = jnp.array([1.0, 0.3])
+    twice = jax.jit(jax.jacfwd(jax.jacfwd(time)))(places)
+    np.testing.assert_allclose(twice, jax.hessian(exact)(places), rtol=1e-9)

@@ -78,7 +78,7 @@ def _efforts(
         with naming(name := f"forces[{index}]"):
             state = element.initial_state(linkage)
             effort, _ = element.act(t, q, qd, linkage, state)
-        total += real_array(name, effort, q.shape)
+        total += real_array(name, effort, q.shape, of="what it returns")
     return total
 
 

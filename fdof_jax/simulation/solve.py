@@ -240,8 +240,9 @@ def _opened(inputs: Inputs) -> Inputs:
 
 
 def _solve(inputs: Inputs, keywords) -> Solution:
+    inputs = _opened(inputs)
     if isinstance(keywords["adjoint"], diffrax.RecursiveCheckpointAdjoint):
-        return _integrate_reversibly(_opened(inputs), keywords)
+        return _integrate_reversibly(inputs, keywords)
     solution = integrate(inputs, keywords, derivatives=True)
     if not isinstance(keywords["adjoint"], diffrax.ForwardMode):
         return solution
