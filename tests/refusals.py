@@ -425,7 +425,7 @@ MORE = {
             scene=step(0.1), limits=tuning.Limits([0.1, 0.1]), **ERRORS)),
         ("scene: expected an equilibrium",
          dict(scene=step(0.1, fj.JointEffort([1.0])), **ERRORS)),
-        ("forces: .* without a state", dict(scene=step(0.1, LAG), **ERRORS)),
+        ("forces.*: .* without a state", dict(scene=step(0.1, LAG), **ERRORS)),
     ],
     "fit": [
         *each(r"scene_at\(...\): expected a Scene", "scene_at", lambda p: p["a"]),
