@@ -227,7 +227,7 @@ def _held_starting() -> Scenes:
     return _held([held.random_scene(rng) for rng in rngs], 2.0)
 
 
-# Seeds of `test_holding`
+# Seeds of random scenes whose joints are held
 TWO_JOINTS = 37, 112, 142, 243, 336, 350
 FOUR_JOINTS = 4, 5, 8, 10, 12, 17, 22, 28
 

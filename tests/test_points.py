@@ -1,7 +1,7 @@
 """Springs, forces and wrenches at points of links: places, loads, times and sides.
 
 Their energies are tested with those of all elements, in test_elements.py, and springs
-against MuJoCo's in test_mjcf.py.
+against MuJoCo's in test_mjcf_reading.py.
 """
 
 import equinox as eqx
