@@ -41,9 +41,10 @@ def test_a_scene_without_elements_costs_the_bare_equations():
 def test_motions_do_not_pay_for_ends_and_jumps_that_they_lack():
     """Programs are as large as before there were conditions, within 2 operations."""
     linkage, state0, forces, *_ = scenes.fig7()
+    ts = jnp.linspace(0, 1, 12)
 
     def motion(q):
-        start, ts = fj.State(q, jnp.zeros(3)), jnp.linspace(0, 1, 12)
+        start = fj.State(q, jnp.zeros(3))
         return fj.simulate(linkage, start, ts, forces, throw=False).q
 
     assert flops(motion, jnp.asarray(state0.q)) <= 22113
