@@ -392,7 +392,7 @@ def _saved(
 
 
 def _row(y: Integrated, args: Arguments) -> PyTree:
-    """Returns what output times keep; of events and memories the last state serves."""
+    """Returns what is saved at output times: no events or memories, read at the end."""
     modes, sampled = args.modes, args.sampled
     modes = None if modes is None else modes._replace(events=None)
     if sampled is not None:
