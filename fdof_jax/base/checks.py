@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 try:
     from jax.extend.core import get_opaque_trace_state
-except ImportError:  # as in JAX 0.6
+except ImportError:  # before JAX 0.10
     from jax.core import get_opaque_trace_state  # pyright: ignore
 
 from .user_warnings import warn

@@ -20,11 +20,6 @@ from jax.experimental import serialize_executable
 from jax.sharding import Mesh
 from jaxtyping import PyTree
 
-try:
-    from jax import enable_x64
-except ImportError:  # as in JAX 0.6
-    from jax.experimental import enable_x64  # pyright: ignore
-
 from ..base.configuration import wide_vectors
 
 Device = Any  # a `jax.Device`, or None for the default one
@@ -67,8 +62,7 @@ def devices_outside_mesh() -> Iterator[list[Device]]:
     They are [None], the default device, if there is only one. Meanwhile no mesh is set,
     whose devices would share each program.
     """
-    set_mesh = jax.__version_info__ >= (0, 8, 1)
-    mesh = jax.sharding.get_mesh() if set_mesh else _NO_MESH
+    mesh = jax.sharding.get_mesh()
     devices = jax.local_devices() if mesh.empty else list(mesh.local_devices)
     with contextlib.nullcontext() if mesh.empty else jax.set_mesh(_NO_MESH):
         yield devices if len(devices) > 1 or not mesh.empty else [None]
@@ -118,5 +112,5 @@ def solve(program: jax.stages.Compiled, *arguments: PyTree) -> PyTree:
 
 def in_thread(function: Callable[..., PyTree], *arguments: PyTree) -> PyTree:
     """Calls a function in a thread, which may not know of the caller's precision."""
-    with enable_x64(True), jax.transfer_guard("allow"):
+    with jax.enable_x64(True), jax.transfer_guard("allow"):
         return function(*arguments)
