@@ -300,7 +300,7 @@ def whole_number(name: str, value: Any, minimum: int, most: int | None = None) -
     **Raises:** ValueError for all else, bools too.
     """
     try:
-        number = None if isinstance(value, bool) else operator.index(value)
+        number = None if isinstance(value, bool | np.bool_) else operator.index(value)
     except Exception:  # whatever a value's own conversion raises
         number = None
     if number is None or number < minimum or (most is not None and number > most):
