@@ -6,6 +6,7 @@ admits. Written out are sound arguments, and what no declaration tells.
 """
 
 import dataclasses
+import functools
 import inspect
 import re
 from pathlib import Path
@@ -146,10 +147,12 @@ WRONG = [
 WRONG_BY_TYPE = {bool: [1, 0, [True]], int: [1.5, "8", [1]]}
 TWO_JOINTS = fj.Solution(TS, ROWS[:, :2], ROWS[:, :2], STATS, SUCCESS)
 NOWHERE = fj.Solution(TS, ROWS * np.nan, ROWS, STATS, SUCCESS)
-STATES = [[ZERO], (ZERO,) * 3, ([[0], [0, 1]], ZERO)]
+STATES = [[ZERO], (ZERO,) * 3, ([[0], [0, 1]], ZERO), ([0, 0], [0, 0])]
 WRONG_BY_NAME = dict(
     linkage=[stacked(ARM)],
-    forces=[DAMPER, [DAMPER], (DAMPER, 3.0), (ZERO,), (fj.JointDamper,)],
+    # The last of these are of other numbers of joints.
+    forces=[DAMPER, [DAMPER], (DAMPER, 3.0), (ZERO,), (fj.JointDamper,),
+            (fj.JointDamper([1.0, 2.0]),)],
     state0=STATES, state=STATES, solution=[ROWS, TWO_JOINTS],
     ts=[[], 0.5, [[0, 1]], [1, 0], [0, 0], [0, 2, 1], [0, np.nan]],
     topology=[
@@ -181,7 +184,7 @@ OF_ITS_OWN = {
     "elements_on.linkage", "sweep.linkage", "to_mjcf.linkage", "to_pandas.linkage",
     "to_xarray.linkage", "reach_margin.ts", "reachable.ts", "PIDController.limit",
     "fit.observed", "fit_each.observed", "joint_names.linkage", "joints_of.linkage",
-    "moving_joints.linkage", "sensitivities.z",
+    "moving_joints.linkage", "present.forces", "sensitivities.z",
 }  # fmt: skip
 # Errors of values that cannot be shown or converted are raised as they are.
 NOT_HOSTILE = {
@@ -271,6 +274,10 @@ def acting(words, *acts, error=ValueError, **changes):
     return words.replace("@", place), dict(forces=acts, **changes), error
 
 
+def seven(_):
+    return jnp.ones(7)
+
+
 def returns(value):
     return lambda t, q, qd, linkage: value
 
@@ -317,22 +324,30 @@ class Pair(NamedTuple):
 
 
 def past_constructors():
-    """Yields elements with one wrong array each, and how the door refuses them."""
-    for part in PARTS:
+    """Yields elements, spoilt in one array each, and how the door refuses them."""
+    for name, place in WITHIN.items():
+        of = lambda part, place=place: functools.reduce(getattr, place.split("."), part)
+        part = elements.ALL[name]
+        spoilt_part = eqx.tree_at(of, part, -jnp.ones(3))
+        yield part, spoilt_part, rf"(forces\[0\]\.)?{place}: expected"
+    for part in ELEMENTS:
         for name, about in type(part).__dataclass_fields__.items():
             rules, value = about.metadata.get("rules"), getattr(part, name)
-            if not isinstance(part, fj.Element) or not rules or not eqx.is_array(value):
+            if not rules or not eqx.is_array(value):
                 continue
             wrong = [(lambda a: a * np.nan, "")]
-            if rules["minimum"] == 0:
-                wrong.append((lambda a: -1 - a, ".* at least 0"))
+            for bound, least in (("minimum", "at least"), ("above", "above")):
+                if rules[bound] == 0:
+                    wrong.append((lambda a: -1 - a, f".* {least} 0"))
             if rules["shape"] == ("joint",):
                 wrong.append((lambda a: jnp.ones(2), "numbers for 3 joints, .* got 2"))
             for change, words in wrong:
                 words = rf"forces\[0\]\.({name}|jump_ts): expected {words}"
-                yield spoilt(part, name, change), words
+                yield part, spoilt(part, name, change), words
 
 
+ELEMENTS = [part for part in PARTS if isinstance(part, fj.Element)]
+WITHIN = {"computed torque": "model.mass", "motor with PID": "command.pd.kd"}
 LAG, SHAPED = fj.control.FirstOrderLag(DAMPER, 0.1), np.zeros((1, 2, 3))
 FRICTION, STOPS = forces.JointFriction(0.4), forces.HardStops(-1, 1)
 BRAKE, MOVED = forces.Brake(1), fj.simulation.PrescribedMotion(1, hold)
@@ -345,10 +360,29 @@ ERRORS = dict(loss=tuning.joint_errors)
 TWO, TWO_STARTS, SEEN = stacked(ARM), stacked(START), np.zeros((5, 3, 2))
 SHARED = "linkage, state0, forces"
 BARE = fj.Scene(ARM, START, (), 1.0)
+# Elements of chains of two or four joints
+PAIRED, FAR = fj.PDController(1, 1, 1, references.SetPoint([0, 0])), fj.Point(4, 0.1)
+FOREIGN = [
+    acting(f"@.{words}", element) for words, element in (
+        *((f"{place}: expected numbers for 3 joints, .*got 2", element)
+          for place, element in (
+              ("coefficient", fj.JointDamper([1, 2])), ("reference.q", PAIRED),
+              ("kp", PAIRED.replace(kp=[1, 1])), ("command.tau", LAG.replace(
+                  command=fj.JointEffort([1, 2]))))),
+        ("reference: .* 3 real numbers for 3 joi", PD.replace(
+            reference=elements.Hold(np.zeros(2)))),
+        ("b.link: expected 0 .* 1 to 3, got 4", fj.SpringDamper(fj.Point(0), FAR)),
+        ("point.link: expected 0 .* 1 to 3, got 4", fj.Wrench(FAR, [1, 0])),
+        ("joints: .* 1 to 3, got 4", fj.simulation.PrescribedMotion(4, hold)),
+        ("model: expected the arm's own topology", fj.control.GravityFeedforward(
+            1, 1, 1, hold, FIG5.linkage)),
+    )
+]  # fmt: skip
 MORE = {
     "Linkage": [
         ("length: .* 4 real numbers for the ground and 3 moving", dict(length=ONES)),
         ("com: .* 3x2 real numbers for 3 moving links", dict(com=ONES)),
+        ("mass: .* 3 real numbers for 3 moving links", dict(mass=ONES)),
         *((rf"{name}: .* at least 0, got \[", {name: [1, 1, -1]})
           for name in ("mass", "inertia")),
         *each("topology: .* 1 to 8 letters", "topology", "RXR", [0, 1j]),
@@ -356,6 +390,7 @@ MORE = {
         *each("topology: .* one real joint at most in each", "topology", [0, 1, 1, 1]),
     ],
     "simulate": [
+        *FOREIGN,
         ("rtol, atol, max_step: expected none beside a stepsize_controller",
          dict(rtol=1e-6, stepsize_controller=FIXED)),
         *((f"linkage.{named}", dict(linkage=spoilt(ARM, name, change)))
@@ -462,6 +497,7 @@ MORE = {
         *each("controller: expected no element that holds", "controller", FRICTION),
     ],
     "from_chain": each("topology: expected no fixed pair", "topology", "RFR"),
+    "present": each("forces", "forces", *WRONG_BY_NAME["forces"][:-1]),
     "reachable": each("reference", "reference", LINE, HELD, lambda t, linkage: None),
     "tip_errors": each("scene", "scene", BARE._replace(forces=(HELD,))),
     "step": [acting("forces: expected elements without", LAG)],
@@ -474,6 +510,9 @@ MORE = {
         acting("solution.own: expected the states",
                fj.control.PIDController(1.0, 1.0, 1.0, 1.0, hold)),
     ],
+    "tip_position": [
+        (rf"linkage\.{name}: .* 3 pairs", dict(linkage=spoilt(ARM, name, seven)))
+        for name in ("com", "length", "mass")],
     "to_xarray": each("solution.ts: expected the same times", "solution",
                       spoilt(stacked(MOTION), "ts", lambda a: a.at[1].add(1.0))),
     "to_mjcf": [
@@ -522,6 +561,8 @@ MORE = {
          dict(level=[1, 2, 3], static=[1, 2])),
         ("static: expected none beside", dict(static=2, speed=1)),
     ],
+    **{name: each("model.mass: expected", "model", spoilt(ARM, "mass", lambda a: -a))
+       for name in ("GravityFeedforward", "ComputedTorque")},
     "HardStops": each("lower: expected less than upper", "lower", 9)
     + each("restitution: expected at most 1", "restitution", 1.1),
     "Payload": [

@@ -94,3 +94,10 @@ def test_where_points_meet_forces_and_derivatives_are_finite():
     np.testing.assert_array_equal(effort(same, q, qd, linkage), 0)
     slope = jax.jacfwd(lambda q: effort(same, q, qd, linkage))(q)
     assert np.isfinite(slope).all()
+
+
+def test_a_link_that_is_traced_and_not_there_is_nowhere():
+    spring = fj.SpringDamper(fj.Point(0, 0.1), fj.Point(4, 0.1), stiffness=1)
+    linkage, q, _ = random_motion("RRR")
+    stored = lambda spring: spring.potential_energy(jnp.asarray(q), linkage)
+    assert np.isnan(jax.jit(stored)(spring))

@@ -5,6 +5,8 @@ import warnings
 from functools import partial
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -82,9 +84,23 @@ def test_what_resists_and_sizes_are_declared_to_be_at_least_zero():
 
 
 def test_the_door_checks_what_a_constructor_has_not_seen():
+    """Programs, which know no values, ask whether they are possible."""
     check = partial(check_elements, linkage=refusals.ARM, ts=refusals.TS)
-    for element, words in refusals.past_constructors():
-        assert not fault(lambda: check((element,)), words), element  # noqa: B023
+    # One program for all of them, of which one is spoilt at a time.
+    possible = eqx.filter_jit(lambda parts: jnp.stack([p.possible() for p in parts]))
+    sound = refusals.ELEMENTS
+    assert possible(sound).all()
+    for part, spoilt, words in refusals.past_constructors():
+        assert not fault(partial(check, (spoilt,)), words), spoilt
+        if "joints" not in words:  # of other numbers of them
+            found = possible([spoilt if one is part else one for one in sound])
+            assert found.sum() == len(sound) - 1, spoilt
+
+
+def test_a_program_knows_elements_of_another_chain():
+    for words, changes, *_ in refusals.FOREIGN:
+        run = lambda q: fj.simulate(refusals.ARM, (q, q), [0, 1], **changes)  # noqa: B023
+        assert not fault(partial(jax.eval_shape, run, np.zeros(3)), words), words
 
 
 @pytest.mark.parametrize(
