@@ -159,9 +159,9 @@ WRONG_BY_NAME = dict(
         "R" * 9, "rrr", "RXR", "", 3, [0, 1, 0], [0, 1] * 9, [[0, 1]] * 3,
         [0, 1, 0, 0.5], [0, 1, 0, np.nan], [0, 1, 0, 1j], ["0", "1"],
     ],
-    max_steps=[0, -1, True], chunk=[0, -1, True], samples=[0, True], starts=[0, True],
-    seed=[-1], max_frames=[0], every=[0], configurations=[1], direction=[2, True],
-    fps=[0],
+    branch=[0, -1.5, "1", True, [1]], max_steps=[0, -1, True], chunk=[0, -1, True],
+    samples=[0, True], starts=[0, True], seed=[-1], max_frames=[0], every=[0],
+    configurations=[1], direction=[2, True], fps=[0],
     speed=[-1], until=[-1, ()], shard=[-1, 1], of=[0, True], dt0=[0.0, -1e-3],
     rtol=[0], atol=[[1e-6]], own0=[(0.0,)], progress_meter=[3], reduce=[3, "q"],
     adjoint=[diffrax.BacksolveAdjoint(), diffrax.ImplicitAdjoint()],
@@ -321,6 +321,13 @@ class Rows(fj.Element):
 class Pair(NamedTuple):
     left: Any
     right: Any
+
+
+class Nowhere(references.Path):
+    """A path without a middle."""
+
+    def point(self, share):
+        return jnp.stack([share, share])
 
 
 def past_constructors():
@@ -571,6 +578,7 @@ MORE = {
         ("velocity: expected zeros", dict(velocity=[1, 0], begin=None)),
         ("place: expected a point of a moving link", dict(place=fj.Point(0))),
     ],
+    "TipTask": each("path: expected a Path that .*`middle`.*got", "path", Nowhere()),
     "EffortHistory": each("ts: expected increasing", "ts", [0, 0, 1, 2], [])
     + each("tau: expected 4 rows", "tau", np.ones((3, 3))),
     "Pulse": [

@@ -1,6 +1,7 @@
 """The package as users import it: what the names are, and what their import costs."""
 
 import ast
+import functools
 import graphlib
 import inspect
 import re
@@ -81,21 +82,41 @@ def test_rooms_import_from_those_below_them_only():
             assert room == module[0] or ROOMS[room] < ROOMS[module[0]], path
 
 
+def leaf_of(place):
+    first, *_ = *place.relative_to(FOLDER).parts, ""
+    return LEAVES.get(first.removesuffix(".py"))
+
+
+@functools.cache
+def imports(path):
+    """Returns the file of each import of the library, and its names, if not itself."""
+    found = []
+    for line in ast.walk(ast.parse(path.read_text())):
+        if isinstance(line, ast.Import):
+            assert not any(n.name.startswith("fdof_jax") for n in line.names), path
+        elif isinstance(line, ast.ImportFrom):
+            module = line.module or ""
+            assert not module.startswith("fdof_jax"), path
+            if line.level:
+                place = path.parents[line.level - 1].joinpath(*module.split("."))
+                for name in (name.name for name in line.names):
+                    module = place / name
+                    alone = module.is_dir() or module.with_suffix(".py").exists()
+                    source, names = (module, set()) if alone else (place, {name})
+                    inside = source / "__init__.py" if source.is_dir() else ""
+                    found.append((Path(inside or f"{source}.py"), names))
+    return found
+
+
 def test_no_modules_import_each_other():
     """Not within functions either, nor for their types; rooms show names of leaves."""
-    modules, graph = {*FOLDER.rglob("*.py")}, {}
-    of_leaf = lambda path: path.relative_to(FOLDER).with_suffix("").parts[0] in LEAVES
-    for path in modules:
-        for line in ast.walk(ast.parse(path.read_text())):
-            if isinstance(line, ast.ImportFrom) and line.level:
-                parts = line.module.split(".") if line.module else []
-                place = path.parents[line.level - 1].joinpath(*parts)
-                places = [place, *(place / name.name for name in line.names)]
-                files = [each.with_suffix(".py") for each in places]
-                found = {*files, *(each / "__init__.py" for each in places)} & modules
-                if not of_leaf(path):
-                    found = {each for each in found if not of_leaf(each)}
-                graph.setdefault(path, set()).update(found - {path})
+    graph = {
+        path: {
+            file for file, _ in imports(path)
+            if file != path and (leaf_of(path) or not leaf_of(file))
+        }
+        for path in FOLDER.rglob("*.py")
+    }  # fmt: skip
     assert sum(map(len, graph.values())) > 500
     graphlib.TopologicalSorter(graph).prepare()  # raises for a circle
 

@@ -129,6 +129,8 @@ def test_real_numbers_of_any_type_are_taken(kind):
     damper, tip = fj.JointDamper(ones), fj.tip_position(arm, ones)
     for found in arm.mass, arm.gravity, damper.coefficient, tip:
         assert found.dtype == float
+    assert fj.CircleTask(branch=ones[0]).branch == 1
+    fj.inverse_kinematics(refusals.ARM, [-4, 2], 1.6, branch=ones[0])
 
 
 @pytest.mark.parametrize("hold", [list, tuple, lambda x: [fj.State(x, x)]])
