@@ -14,6 +14,7 @@ from fdof_jax.forces import HardStops, Payload, Reset, switch
 from fdof_jax.simulation import Until
 from fdof_jax.steps.looped_dopri8 import LoopedDopri8
 
+pytestmark = pytest.mark.slow
 MASS = fj.Linkage(
     "P", length=[0, 0], com=[[0, 0]], mass=[1], inertia=[1], base_angle=0
 )  # upwards
@@ -190,7 +191,6 @@ CASES = {
 }  # fmt: skip
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_times_and_states_are_closed_forms(name):
     """With derivatives along a random change of the numbers that vary."""
@@ -221,7 +221,6 @@ def test_times_and_states_are_closed_forms(name):
             np.testing.assert_allclose(second[k], curves[k], rtol=1e-8, atol=1e-8)
 
 
-@pytest.mark.slow
 def test_the_first_of_several_ends_it():
     """The speed falls through 0, which the first condition does not count."""
     speed = lambda t, q, qd, linkage: qd[0]
@@ -237,7 +236,6 @@ def test_the_first_of_several_ends_it():
     np.testing.assert_array_equal(free.end.q, free.q[-1])
 
 
-@pytest.mark.slow
 def test_members_of_a_sweep_jump_and_end_by_themselves():
     speeds = np.array([0.0, 30.0, np.nan])
     start = fj.State(np.ones((3, 1)), speeds[:, None])
@@ -251,7 +249,6 @@ def test_members_of_a_sweep_jump_and_end_by_themselves():
     np.testing.assert_allclose(swept.end.t[:2], [end, 0.9], rtol=1e-11)
 
 
-@pytest.mark.slow
 def test_jumps_over_other_conditions_are_those_there():
     """A payload slows a bar; so it is lifted over where it is pushed."""
     load = Payload(fj.Point(1, 1.0), mass=1.5, begin=0.5)
@@ -269,7 +266,6 @@ def test_jumps_over_other_conditions_are_those_there():
     np.testing.assert_allclose(motion.q[-1], 2 + speed / 2, rtol=1e-11)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("restitution", [0.1, 0.8])
 def test_jumps_that_follow_each_other_ever_faster_are_named(restitution):
     """Of a ball that comes to rest, after a time that its restitution gives."""
@@ -284,7 +280,6 @@ def test_jumps_that_follow_each_other_ever_faster_are_named(restitution):
         fj.simulate(*scene)
 
 
-@pytest.mark.slow
 def test_where_a_reset_leaves_its_condition():
     """On its zero, beyond it, or before it, from where it comes again."""
 
@@ -305,7 +300,6 @@ def test_where_a_reset_leaves_its_condition():
     assert moved(-0.5, -1e-9, 1.0).outcome == "too many switches"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "wrong, words",
     [

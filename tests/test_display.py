@@ -67,12 +67,9 @@ TEXTS = {
 }
 
 
-def test_elements_show_their_numbers_if_they_are_few():
+def test_elements_and_linkages_show_their_numbers_if_they_are_few():
     for words, value in TEXTS.items():
         assert words in repr(value)
-
-
-def test_a_linkage_shows_its_values():
     arm = make_linkage("RPR")
     again = eval(repr(arm), {"Linkage": fj.Linkage})
     for old, new in zip(jax.tree.leaves(arm), jax.tree.leaves(again)):

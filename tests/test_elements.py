@@ -13,6 +13,7 @@ import fdof_jax as fj
 from fdof_jax.mechanics.equations import zeros
 from fdof_jax.simulation.vector_field import Args, applied, initial_own, schedule_of
 
+pytestmark = pytest.mark.slow
 ARM = elements.arm("RPR")
 
 # Energy
@@ -66,7 +67,6 @@ def balance(linkage, parts, q, qd, tau):
     )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("topology", [*fj.TOPOLOGIES, "RFP", "FPR"])
 def test_energy_is_kept_but_for_what_dampers_take(topology):
     arm, real = elements.arm(topology), chains.moving(topology)
@@ -146,7 +146,6 @@ def acts_of_all():
     return jax.jit(acts, **LOOPS)(ARM, forces, jnp.array(0.1), *start, 0.1)
 
 
-@pytest.mark.slow
 def test_slopes_in_all_numbers_equal_differences():
     """The reverse mode of a motion transposes these: see test_chain_motions.py."""
     states = len(initial_own(Args(ARM, elements.START.q, None, FORCES)))

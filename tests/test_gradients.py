@@ -126,7 +126,7 @@ def test_all_modes_and_differences_agree(point):
 
 
 @pytest.mark.slow
-def test_nothing_is_nan_at_rest_at_zero_error_or_at_saturation():
+def test_nothing_is_nan_at_rest_at_zero_error_or_at_and_beyond_a_limit():
     """An ellipse without axes, where the tip is."""
     tip = tuple(np.asarray(fj.tip_position(ARM, START.q)))
     for gravity in (0.0, 9.81):
@@ -137,11 +137,7 @@ def test_nothing_is_nan_at_rest_at_zero_error_or_at_saturation():
             assert np.isfinite(residuals).all() and np.isfinite(jacobian).all()
             if gravity == 0:
                 assert np.abs(residuals).max() < 1e-12
-
-
-@pytest.mark.slow
-def test_gradients_at_and_beyond_a_limit_are_finite_and_zero():
-    """The efforts are their limits at the start, or everywhere."""
+    # The efforts are their limits at the start, or everywhere.
     scene, slopes = tracked(), {}
     demand = jnp.abs(eqx.filter_jit(scene.forces[0].demand)(0.0, *START, ARM))
     for name, limit in (("at", demand), ("beyond", np.full(2, 1e-3))):
