@@ -501,7 +501,6 @@ MORE = {
     "open_loop": [
         *each(r"joint: expected one of \(1, 2, 3\), got [04T]", "joint", 0, 4, True),
         *each("controller: expected one that", "controller", MOVED),
-        *each("controller: expected no element that holds", "controller", FRICTION),
     ],
     "from_chain": each("topology: expected no fixed pair", "topology", "RFR"),
     "present": each("forces", "forces", *WRONG_BY_NAME["forces"][:-1]),

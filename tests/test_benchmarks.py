@@ -84,9 +84,8 @@ def test_equations_of_peers_are_those_of_the_library():
         exact = np.asarray(fj.forward_dynamics(linkage, q, qd, np.zeros(n)))
         y = absolute(arm, q, qd)
         np.testing.assert_allclose(relative(arm, y), [q, qd], atol=1e-14)
-        found = [
-            np.diff(accelerations(arm, *y.reshape(2, n), np.sin, np.cos), prepend=0)
-        ]
+        turns = accelerations(arm, *y.reshape(2, n), np.sin, np.cos)
+        found = [np.diff(turns, prepend=0)]
         if linkage is arms[1]:  # in arrays
             rates = contestants._textbook_field(0, np.append(q, qd), (linkage, ()))
             found.append(rates[3:])
@@ -100,17 +99,15 @@ def strict(constant):
 
 @pytest.mark.slow
 def test_the_number_of_joints_is_measured_end_to_end(tmp_path):
-    command = [sys.executable, "-m", "benchmarks", "--quick"]
-    result = subprocess.run(
-        [*command, "--only", "joints", "--output", str(tmp_path)], cwd=ROOT,
-        env={**os.environ, "JAX_PLATFORMS": "cpu"}, capture_output=True, text=True,
-    )  # fmt: skip
+    options = "--quick", "--only", "joints", "--output", str(tmp_path)
+    command = [sys.executable, "-m", "benchmarks", *options]
+    env = os.environ | {"JAX_PLATFORMS": "cpu"}
+    result = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True)
     assert result.returncode == 0, result.stdout + result.stderr
     lines = (tmp_path / "joints.jsonl").read_text().splitlines()
     points = [json.loads(line, parse_constant=strict) for line in lines]
-    for point in points:
-        assert set(RECORD) <= set(point)
-        assert {"job", "versions", "cpu", "cores", "load", "commit"} <= set(point)
+    about = {"job", "versions", "cpu", "cores", "load", "commit"}
+    assert all({*RECORD} | about <= set(point) for point in points)
     own = [p for p in points if p["solver"] in ("fdof_jax", "fdof_jax sweep")]
     assert {p["batch"] for p in own} == {1, 16}
     assert all(p["status"] == "ok" and p["flops"] > 0 for p in own)

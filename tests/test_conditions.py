@@ -280,45 +280,46 @@ def test_jumps_that_follow_each_other_ever_faster_are_named(restitution):
         fj.simulate(*scene)
 
 
+def jumping(
+    start, speed=0.0, gravity=9.81, t1=0.7, floor=0.0, low=-9.0, kept=-0.5, lift=0.0,
+    throw=True,
+):  # fmt: skip
+    """A mass is reset at the floor, below a hard stop; its motion would end at `low`."""
+    jumps = Reset(
+        lambda t, q, qd, linkage: q[0] - floor,
+        lambda t, q, qd, linkage: (q + lift, kept * qd),
+    )
+    ends = Until(lambda t, q, qd, linkage: q[0] - low)
+    scene = MASS.replace(gravity=gravity), fj.State([start], [speed]), [0, t1]
+    forces = jumps, ends, HardStops(-np.inf, 2.0)
+    return fj.simulate(*scene, forces, throw=throw)
+
+
 def test_where_a_reset_leaves_its_condition():
     """On its zero, beyond it, or before it, from where it comes again."""
-
-    def moved(start, shift, factor):
-        jumps = Reset(height, lambda t, q, qd, linkage: (q + shift, factor * qd))
-        scene = MASS.replace(gravity=0), fj.State([start], [1.0]), [0, 1.0], (jumps,)
-        return fj.simulate(*scene, throw=False)
-
-    for start, shift, factor, end in [
+    moved = partial(jumping, speed=1.0, gravity=0.0, t1=1.0, throw=False)
+    for start, lift, kept, end in [
         (0.0, 0.0, -1.0, 1.0),  # it starts on the zero
         (-0.5, 0.0, -1.0, -0.5),
         (-0.5, 0.0, 2.0, 1.0),  # it goes on
         (-0.5, 0.3, 1.0, 0.8),
         (-0.5, -0.3, 1.0, -0.1),  # and twice
     ]:
-        found = moved(start, shift, factor).q[-1, 0]
+        found = moved(start, lift=lift, kept=kept).q[-1, 0]
         np.testing.assert_allclose(found, end, atol=1e-12)
-    assert moved(-0.5, -1e-9, 1.0).outcome == "too many switches"
+    assert moved(-0.5, lift=-1e-9, kept=1.0).outcome == "too many switches"
 
 
-@pytest.mark.parametrize(
-    "wrong, words",
-    [
-        (dict(floor=np.nan), r"forces\[0\] is not finite"),
-        (dict(low=np.nan), r"effort of forces\[1\] is not finite"),
-        (dict(kept=np.nan), "new values are"),
-        (dict(lift=9.0), "beyond a hard stop"),
-    ],
-)
+WRONG = [
+    (dict(floor=np.nan), r"forces\[0\] is not finite"),
+    (dict(low=np.nan), r"effort of forces\[1\] is not finite"),
+    (dict(kept=np.nan), "new values are"),
+    (dict(lift=9.0), "beyond a hard stop"),
+]
+
+
+@pytest.mark.parametrize("wrong, words", WRONG)
 def test_functions_that_return_what_cannot_be_are_named(wrong, words):
-    def motion(floor=0.0, low=-9.0, kept=-0.5, lift=0.0):
-        jumps = Reset(
-            lambda t, q, qd, linkage: q[0] - floor,
-            lambda t, q, qd, linkage: (q + lift, kept * qd),
-        )
-        ends = Until(lambda t, q, qd, linkage: q[0] - low)
-        forces = jumps, ends, HardStops(-np.inf, 2.0)
-        return fj.simulate(MASS, fj.State([1.0], [0.0]), [0, 0.7], forces)
-
-    assert motion().events.count == 1
+    assert jumping(1.0).events.count == 1
     with pytest.raises(RuntimeError, match=words):
-        motion(**wrong)
+        jumping(1.0, **wrong)

@@ -80,13 +80,12 @@ RETURNED_BY = dict(
 
 def examples():
     """Returns all code that tests run as examples: doctests and blocks of guides."""
-    sources = (ROOT / "fdof_jax").rglob("*.py")
-    lines = [
-        re.findall(r"^ *(?:>>>|\.\.\.) (.*)", p.read_text(), re.M) for p in sources
-    ]
-    guides = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
-    blocks = [re.findall(r"```python\n(.*?)```", p.read_text(), re.S) for p in guides]
-    return "\n".join(line for group in lines + blocks for line in group)
+    line, block = r"^ *(?:>>>|\.\.\.) (.*)", r"```python\n([\s\S]*?)```"
+    guides = ROOT / "README.md", *(ROOT / "docs").glob("*.md")
+    places = [(path, line) for path in (ROOT / "fdof_jax").rglob("*.py")]
+    places += [(path, block) for path in guides]
+    found = [re.findall(kind, path.read_text(), re.M) for path, kind in places]
+    return "\n".join(sum(found, []))
 
 
 def test_every_name_has_an_example():
@@ -94,9 +93,8 @@ def test_every_name_has_an_example():
     for name in NAMES:
         short = name.split(".")[-1]
         maker = RETURNED_BY.get(short, short)
-        assert re.search(
-            rf"\b(fj(\.[a-z]+)?|scenes|drawing|plotting)\.{maker}\b", ran
-        ), name
+        called = rf"\b(fj(\.[a-z]+)?|scenes|drawing|plotting)\.{maker}\b"
+        assert re.search(called, ran), name
         if short in RETURNED_BY:
             returned = inspect.signature(PUBLIC[maker]).return_annotation
             parts = map(str, returned.__annotations__.values())
@@ -105,8 +103,7 @@ def test_every_name_has_an_example():
 
 def test_every_name_has_a_place_in_the_reference():
     pages = "".join(path.read_text() for path in (ROOT / "docs" / "api").glob("*.md"))
-    listed = re.findall(r"^::: fdof_jax\.(\S+)$", pages, re.M)
-    assert sorted(listed) == sorted(NAMES)
+    assert sorted(re.findall(r"^::: fdof_jax\.(\S+)$", pages, re.M)) == sorted(NAMES)
 
 
 def test_names_in_guides_become_links():

@@ -47,8 +47,7 @@ def test_a_motor_reaches_its_current_and_its_speed():
     rates, ts = np.array([[-2 / 0.5, -0.3 / 0.5], [0.3 / 2, 0]]), np.linspace(0, 5, 21)
     steady = np.linalg.solve(rates, [-12 / 0.5, 0])
     exact = np.array([steady - expm(rates * t) @ steady for t in ts])
-    forces = (motor(12.0, inductance=0.5, gear=3.0),)
-    motion = fj.simulate(WHEEL, STILL, ts, forces)
+    motion = fj.simulate(WHEEL, STILL, ts, (motor(12.0, inductance=0.5, gear=3.0),))
     found = np.hstack([motion.own[0].own, motion.qd])
     np.testing.assert_allclose(found, exact, rtol=1e-6, atol=1e-6)
 

@@ -87,8 +87,7 @@ def test_limits_out_of_reach_are_exceeded_least():
 def test_limits_of_a_joint_that_is_faster_than_the_samples_are_measured():
     frequency, ratio = 190.0, 0.3
     kp, kd = frequency**2 * INERTIA, 2 * ratio * frequency * INERTIA
-    limits = fj.tuning.Limits([0.4], [1.0], [1e6], [0.0])
-    rows = measured(step(kp, kd, t1=20.0), limits)
+    rows = measured(step(kp, kd, t1=20.0), fj.tuning.Limits([0.4], [1.0], [1e6], [0.0]))
     overshoot, settling, effort = (reached for *_, reached in rows)
     damped = np.sqrt(1 - ratio**2)
     np.testing.assert_allclose(overshoot, np.exp(-np.pi * ratio / damped), rtol=1e-3)

@@ -55,8 +55,7 @@ def test_a_wrench_does_the_power_of_force_and_moment(topology, follows):
     wrench = fj.Wrench(tip, [3.0, -2.0], 1.5, follows=follows)
     angle = fj.paper.to_chain(linkage, q, qd)[0][5]
     force = (3 - 2j) * np.exp(1j * angle * follows)
-    jacobian = np.asarray(fj.tip_jacobian(linkage, q))
-    exact = jacobian.T @ [force.real, force.imag, 1.5]
+    exact = np.asarray(fj.tip_jacobian(linkage, q)).T @ [force.real, force.imag, 1.5]
     np.testing.assert_allclose(effort(wrench, q, qd, linkage), exact, atol=1e-13)
     on_ground = wrench.replace(point=fj.Point(0, 1.0))
     np.testing.assert_array_equal(effort(on_ground, q, qd, linkage), 0)

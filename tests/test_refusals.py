@@ -15,6 +15,7 @@ import refusals
 import fdof_jax as fj
 from fdof_jax.simulation.simulate import check_elements
 from fdof_jax.tuning import search
+from fdof_jax.tuning.losses import residuals_of
 
 CALLABLES = refusals.callables()
 
@@ -120,6 +121,20 @@ def test_traced_values_where_known_ones_are_needed(name):
     assert not fault(
         lambda: eqx.filter_jit(function)(**sound), refusals.KNOWN_ALONE[name]
     )
+
+
+def test_a_loss_that_is_negative_is_refused(monkeypatch):
+    """As its root is not a number, whatever the motion is."""
+    loss = lambda scene, motion: -1.0 - motion.q[-1, 0] ** 2
+
+    def evaluated(evaluate, z, *_):
+        value = np.sum(residuals_of(loss, refusals.FIG7, refusals.MOTION) ** 2)
+        rows = np.full(len(z), value), 0 * z, z[:, None] * z[..., None]
+        return search.Evaluation(*rows, {"simulated": np.ones(len(z), bool)})
+
+    monkeypatch.setattr(search, "_evaluate", evaluated)
+    call = lambda: fj.tune(refusals.FIG7, loss=loss)
+    assert not fault(call, "loss: .*one number that is not negative, with finite deriv")
 
 
 @pytest.mark.parametrize("kind", [np.float16, ">f8", np.int8, np.uint64])

@@ -30,10 +30,8 @@ def bodies(linkage, q):
 @pytest.mark.parametrize("topology", ["RRR", "PRP"])
 def test_the_actuator_s_energies_and_power(topology, h=1e-6):
     linkage, q, qd = random_motion(topology)
-    at = bodies(linkage, q)
-    cylinder, piston, turn, stretch = (
-        bodies(linkage, q + h * qd) - bodies(linkage, q - h * qd)
-    ) / (2 * h)
+    at, *ends = (bodies(linkage, q + s * h * qd) for s in (0, 1, -1))
+    cylinder, piston, turn, stretch = np.subtract(*ends) / (2 * h)
     kinetic = 1.2 * abs(cylinder) ** 2 + 0.7 * abs(piston) ** 2 + 0.08 * abs(turn) ** 2
     potential = linkage.gravity * (1.2 * at[0] + 0.7 * at[1]).imag
     bare, full = (fj.energy(linkage, q, qd, own) for own in ((), (ACTUATOR,)))
@@ -47,9 +45,8 @@ def test_the_actuator_s_force_may_depend_on_its_length():
     linkage, q, qd = random_motion("RRR")
     spring = fj.LinearActuator(*PINS, force=lambda t, length, rate: -30 * length - rate)
     same = fj.SpringDamper(*PINS, stiffness=30.0, damping=1.0)
-    np.testing.assert_allclose(
-        spring(0.0, q, qd, linkage), same(0.0, q, qd, linkage), rtol=1e-12
-    )
+    found, expected = (element(0.0, q, qd, linkage) for element in (spring, same))
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("gear", [1.0, 5.0])

@@ -30,10 +30,7 @@ def test_accelerations_energies_and_tips_equal_mujoco(topology):
 
 
 def test_massless_tip_is_passed_as_the_smallest_that_mujoco_takes():
-    linkage = fj.Linkage(
-        "RRR", length=[0, 1, 1, 1], com=[[0.5, 0]] * 3, mass=[1, 1, 0],
-        inertia=[0.1, 0.1, 0.1],
-    )  # fmt: skip
+    linkage = random_linkage("RRR", np.random.default_rng(0)).replace(mass=[1, 1, 0])
     model, data = in_mujoco(fj.to_mjcf(linkage))
     assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
     assert model.opt.timestep == 1e-3 and model.body("link3").mass == 1e-15
@@ -46,13 +43,12 @@ def everything(rng, n, servo):
     positive = lambda: rng.uniform(0.1, 2, size=n)
     points = fj.Point(0, 0.3, -0.9), fj.Point(n, 0.2, 0.1)
     spring = lambda **rest: fj.SpringDamper(*points, stiffness=3.0, **rest)
+    ends = np.append(-np.inf, np.full(n - 1, -50.5)), np.full(n, 60.5)
     parts = [
         fj.JointDamper(positive()),
         fj.forces.Armature(positive()),
         fj.forces.JointSpring(positive(), rng.normal(size=n)),
-        fj.forces.JointStops(
-            np.append(-np.inf, np.full(n - 1, -50.5)), np.full(n, 60.5)
-        ),
+        fj.forces.JointStops(*ends),
         fj.forces.JointFriction(positive()),
         spring(damping=0.3, rest_length=0.4),
         spring(rest_length=0.4, one_sided="cable"),
@@ -84,8 +80,8 @@ def test_what_is_written_is_read(kinds, servo):
     again = fj.from_mjcf(fj.to_mjcf(arm, forces, start))
     equal(again.state0, np.array(start)[:, moves], 1e-15)
     (stops,) = (f for f in again.forces if isinstance(f, fj.forces.JointStops))
-    for ends in zip((stops.lower, stops.upper), (forces[3].lower, forces[3].upper)):
-        equal(ends[0], ends[1][moves])
+    for name in ("lower", "upper"):
+        equal(getattr(stops, name), getattr(forces[3], name)[moves])
     q, qd = rng.normal(size=(2, 2, n)) * moves
     expected = rates(arm, forces, q, qd, None)[0][:, moves]
     found = rates(again.linkage, again.forces, q[:, moves], qd[:, moves], None)[0]

@@ -59,14 +59,13 @@ def test_linkage_is_drawn_where_kinematics_puts_it(topology):
         close(link[0], starts[k - 1])
         close(np.linalg.norm(link[1] - link[0]), linkage.length[k])
         # The fixed offset belongs to the link, the slide to the rail.
-        rail = drawn.get(f"rail {k + 1}", drawn[f"link {k}"]).get_xydata()
-        close(rail[-1], ends[k])
+        rail = drawn.get(f"rail {k + 1}", drawn[f"link {k}"])
+        close(rail.get_xydata()[-1], ends[k])
         if kind == "P":  # the carriage stands across
             turn = drawn[f"slider {k}"]._marker.get_user_transform().get_matrix()
             along = np.diff(drawn[f"rail {k}"].get_xydata(), axis=0)[0]
             close(turn[0, 0] * along[1], turn[1, 0] * along[0])
-        center = fj.mass_centers(linkage, Q)[k - 1]
-        close(drawn[f"mass {k}"].get_xydata()[-1], center)
+        close(drawn[f"mass {k}"].get_xydata()[-1], fj.mass_centers(linkage, Q)[k - 1])
     same(drawn["tip 3"], ends[-1:])
     # What lies on something else hides nothing: mass centres under the tip and pins.
     order = [line.get_gid().split()[0] for line in ax.lines if line.get_gid()]
@@ -92,8 +91,7 @@ def test_chrono_cyclograph_takes_the_nearest_samples():
     ax = drawing.chrono_cyclograph(linkage, solution, every=0.1, until=0.3)
     last_links, samples = named(ax, "link 3"), [0, 10, 20, 30]
     for line, sample in zip(last_links, samples, strict=True):
-        tip = fj.tip_position(linkage, solution.q[sample])
-        close(line.get_xydata()[-1], tip)
+        close(line.get_xydata()[-1], fj.tip_position(linkage, solution.q[sample]))
     brightness = [sum(to_rgb(line.get_color())) for line in last_links]
     assert brightness == sorted(brightness, reverse=True)
     assert len(named(ax, "tip 3")) == 1  # only the last configuration is whole

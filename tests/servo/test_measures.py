@@ -131,10 +131,9 @@ def test_sampled_control_is_measured_as_it_acted():
 
 
 def test_a_report_tells_steps_and_what_a_load_leaves():
-    steps, away = (
-        response(SLIDE, (pd_of(Step(0.0, [0.5])),), stepped(0.0, to), since=0.0)
-        for to in (0.5, 0.55)
-    )
+    forces = (pd_of(Step(0.0, [0.5])),)
+    ends = stepped(0.0, 0.5), stepped(0.0, 0.55)
+    steps, away = (response(SLIDE, forces, motion, since=0.0) for motion in ends)
     assert str(steps).count("\n") == 2 and "steady error" in str(steps)
     np.testing.assert_allclose(away.steady_error, 0.05, atol=2e-4)
     assert "P1 ends 10 % of its step away from the reference" in str(away)

@@ -103,11 +103,11 @@ def test_a_batch_and_titles_make_many_motions(show):
     scaled = [LINKAGE.replace(length=k * LINKAGE.length) for k in (1, 2, 3)]
     arms = jax.tree.map(lambda *leaves: jnp.stack(leaves), *scaled)
     _, data = show(arms, failed)
-    titles = [motion["title"] for motion in data["motions"]]
-    assert titles == ["member 0", "member 1", "member 2"]
-    rows = [array(data, motion["t"]).size for motion in data["motions"]]
-    assert rows == [5, 3, 5]
-    assert [motion["length"][1] for motion in data["motions"]] == [1, 2, 3]
+    about = [
+        (motion["title"], array(data, motion["t"]).size, motion["length"][1])
+        for motion in data["motions"]
+    ]
+    assert about == [("member 0", 5, 1), ("member 1", 3, 2), ("member 2", 5, 3)]
     arms, spring = {"a": LINKAGE, "b": ARM}, fj.SpringDamper(HOOK, TIP, stiffness=1)
     _, data = show(arms, {"a": SOLUTION, "b": swinging(7)}, {"a": (), "b": (spring,)})
     first, second = data["motions"]
