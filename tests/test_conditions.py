@@ -26,10 +26,6 @@ def height(t, q, qd, linkage):
     return q[0]
 
 
-def bounce(restitution):
-    return Reset(height, lambda t, q, qd, linkage: (q, -restitution * qd), -1)
-
-
 # What may happen to one joint, by numbers of programs that all cases share: it hits a
 # floor; is reset at q = at + rise t, `up` and `down` being factors of its rate; is
 # driven by an effort that switches with its rate if `side` is 1; and ends where
@@ -240,8 +236,8 @@ def test_members_of_a_sweep_jump_and_end_by_themselves():
     speeds = np.array([0.0, 30.0, np.nan])
     start = fj.State(np.ones((3, 1)), speeds[:, None])
     rises = Until(lambda t, q, qd, linkage: q[0] - 0.2, direction=1)
-    forces = bounce(0.5), rises
-    swept = fj.sweep(MASS, start, [0, 0.9], forces, solver=LoopedDopri8())
+    bounces = Reset(height, lambda t, q, qd, linkage: (q, -0.5 * qd), -1)
+    swept = fj.sweep(MASS, start, [0, 0.9], (bounces, rises), solver=LoopedDopri8())
     assert swept.outcome.tolist() == ["ended", "successful", "not finite"]
     assert swept.events.count.tolist() == [1, 0, 0]
     fall, up = np.sqrt(2 / 9.81), np.sqrt(2 * 9.81) / 2
@@ -266,33 +262,31 @@ def test_jumps_over_other_conditions_are_those_there():
     np.testing.assert_allclose(motion.q[-1], 2 + speed / 2, rtol=1e-11)
 
 
-@pytest.mark.parametrize("restitution", [0.1, 0.8])
-def test_jumps_that_follow_each_other_ever_faster_are_named(restitution):
-    """Of a ball that comes to rest, after a time that its restitution gives."""
-    switches = lambda t, q, qd, linkage: switch(q[0] - 0.9, 0 * q, 0 * q)
-    forces = (bounce(jnp.array(restitution)), switches)
-    scene = MASS, fj.State([1.0], [0.0]), [0, 9.0], forces
-    motion = fj.simulate(*scene, throw=False)
-    assert motion.outcome == "too many switches"
-    rests = np.sqrt(2 / 9.81) * (1 + restitution) / (1 - restitution)
-    np.testing.assert_allclose(motion.stats["time_reached"], rests, rtol=1e-5)
-    with pytest.raises(RuntimeError, match=r"is reset\. forces\[0\] \(Reset\)"):
-        fj.simulate(*scene)
-
-
 def jumping(
     start, speed=0.0, gravity=9.81, t1=0.7, floor=0.0, low=-9.0, kept=-0.5, lift=0.0,
     throw=True,
 ):  # fmt: skip
-    """A mass is reset at the floor, below a hard stop; its motion would end at `low`."""
+    """A mass is reset at the floor, below a hard stop; at `low` its motion ends."""
     jumps = Reset(
         lambda t, q, qd, linkage: q[0] - floor,
         lambda t, q, qd, linkage: (q + lift, kept * qd),
     )
     ends = Until(lambda t, q, qd, linkage: q[0] - low)
     scene = MASS.replace(gravity=gravity), fj.State([start], [speed]), [0, t1]
-    forces = jumps, ends, HardStops(-np.inf, 2.0)
+    switches = lambda t, q, qd, linkage: switch(q[0] - 0.9, 0 * q, 0 * q)
+    forces = jumps, ends, HardStops(-np.inf, 2.0), switches
     return fj.simulate(*scene, forces, throw=throw)
+
+
+@pytest.mark.parametrize("restitution", [0.1, 0.8])
+def test_jumps_that_follow_each_other_ever_faster_are_named(restitution):
+    """Of a ball that comes to rest, after a time that its restitution gives."""
+    motion = jumping(1.0, kept=-restitution, t1=9.0, throw=False)
+    assert motion.outcome == "too many switches"
+    rests = np.sqrt(2 / 9.81) * (1 + restitution) / (1 - restitution)
+    np.testing.assert_allclose(motion.stats["time_reached"], rests, rtol=1e-5)
+    with pytest.raises(RuntimeError, match=r"is reset\. forces\[0\] \(Reset\)"):
+        jumping(1.0, kept=-restitution, t1=9.0)
 
 
 def test_where_a_reset_leaves_its_condition():

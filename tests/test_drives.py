@@ -1,5 +1,6 @@
 """Servo drives: closed forms, limits, and the states that they integrate."""
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -39,6 +40,16 @@ def test_a_lag_is_an_exponential():
     own0 = jax.tree.map(lambda x: jnp.nan * x, (LAG.initial_state(WHEEL),))
     lost = fj.simulate(WHEEL, STILL, ts, (LAG,), own0=own0, throw=False)
     assert lost.outcome == "not finite" and lost.stats["num_steps"] < 100
+
+
+def test_a_condition_ends_a_motion_under_sampled_control():
+    """Between samples: q = t^2."""
+    ends = dict(until=lambda t, q, qd, linkage: q[0] - 0.04, rtol=1e-9, atol=1e-12)
+    pushed = WHEEL, STILL, fj.JointEffort([4.0]), 0.07, 4
+    motion = fj.simulate_sampled(*pushed, solver=diffrax.Tsit5(), **ends)
+    assert motion.ended and motion.tau.shape == (4, 1)
+    np.testing.assert_allclose([motion.end.t, *motion.end.qd], [0.2, 0.4], rtol=1e-9)
+    np.testing.assert_allclose(motion.q[:, 0], [0, 0.07**2, 0.14**2, np.nan, np.nan])
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ ARM = elements.arm("RPR")
 # Energy
 
 # Numbers without which elements keep the energy. That of an actuator adds energy: see
-# test_actuators.py.
+# test_points.py.
 LOSSES = {"coefficient", "level", "damping"}
 BETWEEN = fj.Point(1, 0.4, 0.1), elements.TIP  # of two links that move
 MORE = {
