@@ -113,14 +113,12 @@ def of_fall(q0, qd0, gravity, stop_at, **_):
 def of_bar(q0, gravity, mass, **_):
     moment, inertia = mass * gravity / 2, 1 / 12 + mass / 4
     time = jnp.sqrt(inertia / moment) * quarter(jnp.sin((q0 - HANGS) / 2) ** 2)
-    rate = -jnp.sqrt(2 * moment / inertia * (1 + jnp.sin(q0)))
-    return dict(t=time, q=HANGS, qd=rate)
+    return dict(t=time, q=HANGS, qd=-jnp.sqrt(2 * moment / inertia * (1 + jnp.sin(q0))))
 
 
 def of_swing(qd0, gravity, **_):
     pace = 1.5 * gravity
-    time = 2 * quarter(qd0**2 / 4 / pace) / jnp.sqrt(pace)
-    return dict(t=time, q=HANGS, qd=-qd0)
+    return dict(t=2 * quarter(qd0**2 / 4 / pace) / jnp.sqrt(pace), q=HANGS, qd=-qd0)
 
 
 def of_blow(q0, gravity, restitution, **_):

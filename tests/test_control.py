@@ -30,8 +30,7 @@ def arm(topology, seed=0):
 
 
 def pd_at(q, kp, kd):
-    n = len(q)
-    full = lambda value: np.broadcast_to(value, n).astype(float)
+    full = lambda value: np.broadcast_to(value, len(q)).astype(float)
     return fj.PDController(full(kp), full(kd), full(np.inf), Stand(q))
 
 

@@ -60,8 +60,7 @@ def test_joints_that_are_known_to_be_absent_cost_nothing():
     known, asked = link_constants(arm, q), jax.jit(link_constants)(arm, q)
     cost_of = lambda constants: flops(rates, constants, zeros(q), tuple(q), zeros(q))
     assert cost_of(known) <= 416 < cost_of(asked) <= 530
-    state0 = fj.State(q, jnp.zeros(3))
-    motion = lambda arm: fj.simulate(arm, state0, [0, 1.0]).q
+    motion = lambda arm: fj.simulate(arm, fj.State(q, jnp.zeros(3)), [0, 1.0]).q
     known = flops(lambda mass: motion(arm.replace(mass=mass)), arm.mass)
     assert known < flops(motion, arm) - 12 * 80  # at the stages of a step
 
@@ -123,8 +122,7 @@ def compiled_solve(linkage):
     joints, ts = len(linkage.mass), jnp.linspace(0, 1, 12)
 
     def motion(q):
-        state = fj.State(q, jnp.zeros(joints))
-        return fj.simulate(linkage, state, ts, throw=False).q
+        return fj.simulate(linkage, fj.State(q, jnp.zeros(joints)), ts, throw=False).q
 
     return jax.jit(jax.vmap(motion)).lower(jnp.zeros((16, joints))).compile().as_text()
 

@@ -62,8 +62,7 @@ def outcome(scene, numbers, ts, adjoint):
     scene = changed(scene, numbers)
     options = dict(stepsize_controller=STEPS, adjoint=adjoint, max_steps=4096)
     motion = fj.simulate(scene, ts, **options)
-    reference = scene.forces[0].reference
-    deviation = tip_deviation(scene.linkage, reference, motion)
+    deviation = tip_deviation(scene.linkage, scene.forces[0].reference, motion)
     return jnp.stack([jnp.mean(deviation**2), jnp.sum(motion.q[-1])]), motion
 
 

@@ -167,8 +167,7 @@ def test_the_regressor_times_the_parameters_is_the_inverse_dynamics(topology):
     linkage, *_ = random_motion(topology)
     samples = np.random.default_rng(1).uniform(-2, 2, (3, 40, 3))
     matrix, tau = of_samples(linkage, *samples)
-    parameters = fj.analysis.inertial_parameters(linkage)
-    found = np.einsum("tjlp,lp->tj", matrix, parameters)
+    found = np.einsum("tjlp,lp->tj", matrix, fj.analysis.inertial_parameters(linkage))
     np.testing.assert_allclose(found, tau, rtol=1e-9, atol=1e-9)
     rows = np.asarray(matrix).reshape(120, 12)
     if count := DETERMINED.get(topology):

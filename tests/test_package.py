@@ -170,8 +170,7 @@ def test_messages_show_values_through_one_function():
 def test_each_fault_of_mutants_has_its_place():
     """`python tests/mutants.py` takes an hour: a name that changed shows here."""
     for name, mutant in MUTANTS.items():
-        text = (FOLDER / mutant.file).read_text()
-        assert text.count(mutant.old) == 1, name
+        assert (FOLDER / mutant.file).read_text().count(mutant.old) == 1, name
         file, _, test = mutant.check.partition("::")
         found = (
             not test or f"def {test.partition('[')[0]}(" in (ROOT / file).read_text()

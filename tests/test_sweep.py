@@ -164,8 +164,7 @@ def test_arrays_without_the_axis_are_shared():
     own = jax.tree.map(lambda a: np.stack([a] * 3) if eqx.is_array(a) else a, pd)
     forces = DAMPER, eqx.tree_at(lambda pd: pd.kp, own, kp), pd
     axes = None, 0, None
-    start = fj.State(q, [1])
-    motion = fj.sweep(PENDULUM, start, ts, forces, forces_axes=axes, **SHORT)
+    motion = fj.sweep(PENDULUM, fj.State(q, [1]), ts, forces, forces_axes=axes, **SHORT)
     ts[:] = 0  # the motion keeps its own, once for all members
     assert motion.ts.strides[0] == 0
     np.testing.assert_array_equal(motion.ts, np.tile(TS, (3, 1)))

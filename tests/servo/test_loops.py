@@ -224,8 +224,7 @@ def test_the_bandwidth_is_that_of_the_response_to_the_reference(name):
     controller, above, below = FOLLOWERS[name]
     response = lambda s: np.polyval(above, s) / np.polyval(below, s)
     following = closed_loop(PENDULUM, POSITION, controller, joint=1)
-    expected = response(FREQUENCIES)
-    np.testing.assert_allclose(following(FREQUENCIES), expected, rtol=1e-8)
+    np.testing.assert_allclose(following(FREQUENCIES), response(FREQUENCIES), rtol=1e-8)
     edge, whole = bandwidth(following), abs(response(0))
     np.testing.assert_allclose(abs(response(1j * edge)), 10**-0.15 * whole, rtol=1e-8)
     slower = abs(response(1j * np.linspace(0, 0.999 * edge, 999)))
