@@ -115,13 +115,6 @@ def test_the_number_of_joints_is_measured_end_to_end(tmp_path):
     assert "16 arms [s per s]" in result.stdout
 
 
-def test_a_page_is_of_one_commit():
-    point = {"cpu": "one", "date": "today", "versions": {}, "commit": "a"}
-    assert "commit a" in page.machine({"x": [point], "y": [point]})
-    with pytest.raises(ValueError, match="those of one commit"):
-        page.machine({"x": [point], "y": [point | {"commit": "b"}]})
-
-
 def test_ratios_are_those_of_rounds():
     points = measured(_case("fast", 1e-3), _case("slow", 1e-9), ratio_to="fast")
     assert points[0]["ratio"] == pytest.approx(1.0)
@@ -133,8 +126,11 @@ def test_ratios_are_those_of_rounds():
     assert page.ratio(ours, others, 1e-12) == "-"
 
 
-def test_the_page_is_that_of_the_results():
-    """Its numbers are drawn from `results`, which are those of one commit."""
+def test_the_page_is_that_of_the_results_of_one_commit():
+    point = {"cpu": "one", "date": "today", "versions": {}, "commit": "a"}
+    assert "commit a" in page.machine({"x": [point], "y": [point]})
+    with pytest.raises(ValueError, match="those of one commit"):
+        page.machine({"x": [point], "y": [point | {"commit": "b"}]})
     text = (ROOT / "benchmarks/README.md").read_text()
     assert page.filled(text, page.texts(load(ROOT / "benchmarks/results"))) == text
     assert text.count("\n") <= 200

@@ -73,14 +73,6 @@ def test_a_spline_is_scipy_s(kind):
     np.testing.assert_allclose(found, exact(shares), atol=1e-13)
 
 
-def test_rounding_beside_the_negative_x_axis_adds_no_turn():
-    for side in (1e-13, -1e-13):
-        line = Line([-1.3, side], [-1.5, side])
-        q, _ = fj.TipTask(line, Travel(1.0), orientation=np.pi)(0.5, ARM)
-        np.testing.assert_allclose(q.sum(), np.pi, rtol=1e-6)
-        assert q[0] > 0
-
-
 # Circles
 
 
@@ -252,7 +244,13 @@ def test_paths_are_checked_over_the_time_of_the_run(path, timing, bad, good, wor
         assert fits(good)
 
 
-def test_what_a_task_commands_out_of_reach_is_refused_or_nan():
+def test_a_line_beside_the_negative_x_axis_and_one_out_of_reach():
+    """Rounding adds no turn; what a task commands is refused or NaN."""
+    for side in (1e-13, -1e-13):
+        line = Line([-1.3, side], [-1.5, side])
+        q, _ = fj.TipTask(line, Travel(1.0), orientation=np.pi)(0.5, ARM)
+        np.testing.assert_allclose(q.sum(), np.pi, rtol=1e-6)
+        assert q[0] > 0
     task = fj.TipTask(Line([1, 1], [9, 9]), lambda t: t, branch=-1)
     words = r"^t: .* 0 rad on branch -1.* got 1 s, .*\[9, 9\] m, beyond it by [0-9.]+ m"
     with pytest.raises(ValueError, match=words):

@@ -113,11 +113,11 @@ def test_names_of_joints_of_two_kinds_and_of_any_number():
     assert [column.split()[0] for column in columns[:5]] == names
 
 
-@pytest.mark.parametrize("name", ["xarray", "pandas"])
-def test_a_package_that_is_missing_is_named_with_the_extra(name, monkeypatch):
-    monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(ImportError, match=rf"{name} .*fdof_jax\[data\]"):
-        getattr(fj, f"to_{name}")(make_linkage("RRR"), solution())
+def test_a_package_that_is_missing_is_named_with_the_extra(monkeypatch):
+    for name, call in ("xarray", fj.to_xarray), ("pandas", fj.to_pandas):
+        monkeypatch.setitem(sys.modules, name, None)
+        with pytest.raises(ImportError, match=rf"{name} .*fdof_jax\[data\]"):
+            call(make_linkage("RRR"), solution())
 
 
 # Words, without traced values

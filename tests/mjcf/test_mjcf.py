@@ -90,7 +90,8 @@ def test_what_is_written_is_read(kinds, servo):
     equal(*tips, 1e-12)
 
 
-def test_a_scene_is_written_whole():
+def test_a_scene_is_written_whole_and_limits_of_one_joint_leave_others_free():
+    """A limited joint beside a motor; gains of 0; both come back."""
     scene = fj.scenes.fig7()
     again = fj.from_mjcf(fj.to_mjcf(scene))
     (pd,), (expected,) = again.forces, scene.forces
@@ -99,6 +100,15 @@ def test_a_scene_is_written_whole():
         equal(getattr(pd, name), getattr(expected, name))
     start = lambda pd: np.array(pd.schedule(np.zeros(()), scene.linkage))
     equal(start(pd), start(expected))
+    arm = random_linkage("RRR", np.random.default_rng(0))
+    point = fj.references.SetPoint([0.1, 0.2, 0.3])
+    pd = fj.PDController([5.0, 0, 0], [0, 2.0, 0], [3, 2, 1], point)
+    again = fj.from_mjcf(fj.to_mjcf(arm, (pd, fj.JointEffort([0, 0, 4.0]))))
+    servo, motor = again.forces
+    equal((servo.kp, servo.kd, servo.limit), (pd.kp, pd.kd, [3, 2, np.inf]))
+    equal(motor.tau, [0, 0, 4])
+    with pytest.raises(ValueError, match="forces.0.: expected no limit of efforts"):
+        fj.to_mjcf(arm, (pd, fj.JointEffort(1.0)))
 
 
 def test_arms_with_fixed_pairs_come_back_as_they_were():
@@ -112,16 +122,3 @@ def test_arms_with_fixed_pairs_come_back_as_they_were():
         equal(fj.tip_position(again, q[moves]), fj.tip_position(arm, q), 1e-12)
         qdd = fj.forward_dynamics(again, q[moves], qd[moves], tau[moves])
         equal(qdd, fj.forward_dynamics(arm, q, qd, tau)[moves], 1e-9)
-
-
-def test_limits_of_one_joint_leave_others_free():
-    """A limited joint beside a motor; gains of 0; both come back."""
-    arm = random_linkage("RRR", np.random.default_rng(0))
-    point = fj.references.SetPoint([0.1, 0.2, 0.3])
-    pd = fj.PDController([5.0, 0, 0], [0, 2.0, 0], [3, 2, 1], point)
-    again = fj.from_mjcf(fj.to_mjcf(arm, (pd, fj.JointEffort([0, 0, 4.0]))))
-    servo, motor = again.forces
-    equal((servo.kp, servo.kd, servo.limit), (pd.kp, pd.kd, [3, 2, np.inf]))
-    equal(motor.tau, [0, 0, 4])
-    with pytest.raises(ValueError, match="forces.0.: expected no limit of efforts"):
-        fj.to_mjcf(arm, (pd, fj.JointEffort(1.0)))
