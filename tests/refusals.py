@@ -45,6 +45,13 @@ def height(t, q, qd, linkage):
     return q[0]
 
 
+def step(limit, *others):
+    """Returns a scene of one joint, which follows no task."""
+    bar = fj.Linkage("R", length=[0, 1], com=[[0, 0]], mass=[1], inertia=[1], gravity=0)
+    pd = fj.PDController([6.0], [1.0], [limit], references.SetPoint([1.0]))
+    return fj.Scene(bar, fj.State([0.0], [0.0]), (pd, *others), 4.0)
+
+
 def stacked(tree, members=2):
     return jax.tree.map(lambda a: jnp.stack([a] * members), tree)
 
@@ -81,6 +88,7 @@ OWN = {
     "reference_of": dict(value=TASK),
     "response": dict(forces=(HELD,)),
     "sweep": dict(linkage=stacked(ARM), state0=stacked(START)),
+    "tune_within": dict(scene=step(0.1), loss=tuning.joint_errors),
 }
 LAW = elements.WITH_STATE["actuators"]
 PARTS = [
@@ -107,6 +115,7 @@ def callables():
                 name = f"paper.{name}"
             known = BY_NAME | OWN.get(name, {})
             needed = [p.name for p in arguments(function) if p.default is p.empty]
+            needed += OWN.get(name, {})
             sound = parts.get(function) or {place: known[place] for place in needed}
             found[name] = function, sound
     return found
@@ -298,13 +307,6 @@ def spoilt(tree, name, change):
     return eqx.tree_at(place, tree, change(place(tree)))
 
 
-def step(limit, *others):
-    """Returns a scene of one joint, which follows no task."""
-    bar = fj.Linkage("R", length=[0, 1], com=[[0, 0]], mass=[1], inertia=[1], gravity=0)
-    pd = fj.PDController([6.0], [1.0], [limit], references.SetPoint([1.0]))
-    return fj.Scene(bar, fj.State([0.0], [0.0]), (pd, *others), 4.0)
-
-
 @dataclasses.dataclass
 class Unhashable:
     def __call__(self, *arguments):
@@ -363,7 +365,6 @@ FIG5, RRR = fj.scenes.fig5(), fj.scenes.circle_scenes()["RRR"]
 ONES, FIXED = np.ones((2, 3)), diffrax.ConstantStepSize()
 FLAT = tuple(ONES[:, :2])  # of two joints
 UNLIMITED = FIG7._replace(forces=(PD.replace(limit=np.full(3, np.inf)),))
-ERRORS = dict(loss=tuning.joint_errors)
 TWO, TWO_STARTS, SEEN = stacked(ARM), stacked(START), np.zeros((5, 3, 2))
 SHARED = "linkage, state0, forces"
 BARE = fj.Scene(ARM, START, (), 1.0)
@@ -458,12 +459,10 @@ MORE = {
     "stacked": each(r"scenes\[1\]: expected one like scenes\[0\]", "scenes",
                     [FIG7, FIG5], [RRR, RRR._replace(forces=(*RRR.forces, DAMPER))]),
     "tune_within": [
-        (".* its controller to track a task with a `tip`", dict(scene=step(0.1))),
-        (r"limits.overshoot: .* for 1 joints", dict(
-            scene=step(0.1), limits=tuning.Limits([0.1, 0.1]), **ERRORS)),
-        ("scene: expected an equilibrium",
-         dict(scene=step(0.1, fj.JointEffort([1.0])), **ERRORS)),
-        ("forces.*: .* without a state", dict(scene=step(0.1, LAG), **ERRORS)),
+        *each(".* controller to track a task with a `tip`", "loss", tuning.Tracking()),
+        *each("limits.overshoot: .* for 1 joints", "limits", tuning.Limits([0.1, 0.1])),
+        *each("scene: expected an equil", "scene", step(0.1, fj.JointEffort([1.0]))),
+        *each("forces.*: .* without a state", "scene", step(0.1, LAG)),
     ],
     "fit": [
         *each(r"scene_at\(...\): expected a Scene", "scene_at", lambda p: p["a"]),
