@@ -48,26 +48,15 @@ def test_docstring(name):
 
 
 # Every name that a user may import, with its module unless that is `fdof_jax`.
-NAMES = [
-    *(name for name in fj.__all__ if not inspect.ismodule(getattr(fj, name))),
-    *(
-        f"{room.__name__.removeprefix('fdof_jax.')}.{name}"
-        for room in ROOMS
-        for name in room.__all__
-        if getattr(fj, name, None) is not getattr(room, name)
-    ),
-    *(
-        f"scenes.{name}"
-        for name, value in inspect.getmembers(fj.scenes, inspect.isfunction)
-        if value.__module__ == fj.scenes.__name__
-    ),
-    *(
-        f"{module.__name__.split('.')[-1]}.{name}"
-        for module in (drawing, plotting)
-        for name in module.__all__
-        if inspect.isfunction(getattr(module, name))
-    ),
-]  # fmt: skip
+NAMES = [name for name in fj.__all__ if not inspect.ismodule(getattr(fj, name))]
+NAMES += [
+    f"{module.__name__.split('.')[-1]}.{name}"
+    for module in (*ROOMS, scenes, drawing, plotting)
+    for name, value in inspect.getmembers(module, callable)
+    if name
+    in getattr(module, "__all__", [name] * (value.__module__ == scenes.__name__))
+    and getattr(fj, name, None) is not value
+]
 # Classes of results, and of their parts: the function that returns each.
 RETURNED_BY = dict(
     FitResult="fit", Efforts="joint_efforts", Frames="link_frames", End="simulate",

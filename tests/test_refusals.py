@@ -104,13 +104,10 @@ def test_a_program_knows_elements_of_another_chain():
         assert not fault(partial(jax.eval_shape, run, np.zeros(3)), words), words
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(n, marks=[pytest.mark.slow] * (n in refusals.SLOW))
-        for n in refusals.MORE
-    ],
-)
+@pytest.mark.parametrize("name", [
+    pytest.param(n, marks=[pytest.mark.slow] * (n in refusals.SLOW))
+    for n in refusals.MORE
+])  # fmt: skip
 def test_what_no_declaration_tells(name, refuses):
     refuses(name, refusals.MORE[name])
 
