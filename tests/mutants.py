@@ -448,7 +448,7 @@ MUTANTS = {
         "tuning/search.py",
         "((z >= high) & (gradient < 0))",
         "((z >= high) & (gradient > 0))",
-        "tests/test_bounded_search.py"
+        "tests/test_limits.py"
         "::test_runs_that_fail_that_bounds_hold_and_that_are_flat_end_beside_another",
     ),
     # Instants: elements, references, analyses

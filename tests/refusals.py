@@ -6,6 +6,7 @@ admits. Written out are sound arguments, and what no declaration tells.
 """
 
 import dataclasses
+import functools
 import inspect
 import re
 from pathlib import Path
@@ -44,6 +45,13 @@ def height(t, q, qd, linkage):
     return q[0]
 
 
+def step(limit, *others):
+    """Returns a scene of one joint, which follows no task."""
+    bar = fj.Linkage("R", length=[0, 1], com=[[0, 0]], mass=[1], inertia=[1], gravity=0)
+    pd = fj.PDController([6.0], [1.0], [limit], references.SetPoint([1.0]))
+    return fj.Scene(bar, fj.State([0.0], [0.0]), (pd, *others), 4.0)
+
+
 def stacked(tree, members=2):
     return jax.tree.map(lambda a: jnp.stack([a] * members), tree)
 
@@ -80,6 +88,7 @@ OWN = {
     "reference_of": dict(value=TASK),
     "response": dict(forces=(HELD,)),
     "sweep": dict(linkage=stacked(ARM), state0=stacked(START)),
+    "tune_within": dict(scene=step(0.1), loss=tuning.joint_errors),
 }
 LAW = elements.WITH_STATE["actuators"]
 PARTS = [
@@ -106,6 +115,7 @@ def callables():
                 name = f"paper.{name}"
             known = BY_NAME | OWN.get(name, {})
             needed = [p.name for p in arguments(function) if p.default is p.empty]
+            needed += OWN.get(name, {})
             sound = parts.get(function) or {place: known[place] for place in needed}
             found[name] = function, sound
     return found
@@ -146,19 +156,21 @@ WRONG = [
 WRONG_BY_TYPE = {bool: [1, 0, [True]], int: [1.5, "8", [1]]}
 TWO_JOINTS = fj.Solution(TS, ROWS[:, :2], ROWS[:, :2], STATS, SUCCESS)
 NOWHERE = fj.Solution(TS, ROWS * np.nan, ROWS, STATS, SUCCESS)
-STATES = [[ZERO], (ZERO,) * 3, ([[0], [0, 1]], ZERO)]
+STATES = [[ZERO], (ZERO,) * 3, ([[0], [0, 1]], ZERO), ([0, 0], [0, 0])]
 WRONG_BY_NAME = dict(
     linkage=[stacked(ARM)],
-    forces=[DAMPER, [DAMPER], (DAMPER, 3.0), (ZERO,), (fj.JointDamper,)],
+    # The last of these are of other numbers of joints.
+    forces=[DAMPER, [DAMPER], (DAMPER, 3.0), (ZERO,), (fj.JointDamper,),
+            (fj.JointDamper([1.0, 2.0]),)],
     state0=STATES, state=STATES, solution=[ROWS, TWO_JOINTS],
     ts=[[], 0.5, [[0, 1]], [1, 0], [0, 0], [0, 2, 1], [0, np.nan]],
     topology=[
         "R" * 9, "rrr", "RXR", "", 3, [0, 1, 0], [0, 1] * 9, [[0, 1]] * 3,
         [0, 1, 0, 0.5], [0, 1, 0, np.nan], [0, 1, 0, 1j], ["0", "1"],
     ],
-    max_steps=[0, -1, True], chunk=[0, -1, True], samples=[0, True], starts=[0, True],
-    seed=[-1], max_frames=[0], every=[0], configurations=[1], direction=[2, True],
-    fps=[0],
+    branch=[0, -1.5, "1", True, [1]], max_steps=[0, -1, True], chunk=[0, -1, True],
+    samples=[0, True], starts=[0, True], seed=[-1], max_frames=[0], every=[0],
+    configurations=[1], direction=[2, True], fps=[0],
     speed=[-1], until=[-1, ()], shard=[-1, 1], of=[0, True], dt0=[0.0, -1e-3],
     rtol=[0], atol=[[1e-6]], own0=[(0.0,)], progress_meter=[3], reduce=[3, "q"],
     adjoint=[diffrax.BacksolveAdjoint(), diffrax.ImplicitAdjoint()],
@@ -181,7 +193,7 @@ OF_ITS_OWN = {
     "elements_on.linkage", "sweep.linkage", "to_mjcf.linkage", "to_pandas.linkage",
     "to_xarray.linkage", "reach_margin.ts", "reachable.ts", "PIDController.limit",
     "fit.observed", "fit_each.observed", "joint_names.linkage", "joints_of.linkage",
-    "moving_joints.linkage", "sensitivities.z",
+    "moving_joints.linkage", "present.forces", "sensitivities.z",
 }  # fmt: skip
 # Errors of values that cannot be shown or converted are raised as they are.
 NOT_HOSTILE = {
@@ -271,6 +283,10 @@ def acting(words, *acts, error=ValueError, **changes):
     return words.replace("@", place), dict(forces=acts, **changes), error
 
 
+def seven(_):
+    return jnp.ones(7)
+
+
 def returns(value):
     return lambda t, q, qd, linkage: value
 
@@ -291,13 +307,6 @@ def spoilt(tree, name, change):
     return eqx.tree_at(place, tree, change(place(tree)))
 
 
-def step(limit, *others):
-    """Returns a scene of one joint, which follows no task."""
-    bar = fj.Linkage("R", length=[0, 1], com=[[0, 0]], mass=[1], inertia=[1], gravity=0)
-    pd = fj.PDController([6.0], [1.0], [limit], references.SetPoint([1.0]))
-    return fj.Scene(bar, fj.State([0.0], [0.0]), (pd, *others), 4.0)
-
-
 @dataclasses.dataclass
 class Unhashable:
     def __call__(self, *arguments):
@@ -316,23 +325,38 @@ class Pair(NamedTuple):
     right: Any
 
 
+class Nowhere(references.Path):
+    """A path without a middle."""
+
+    def point(self, share):
+        return jnp.stack([share, share])
+
+
 def past_constructors():
-    """Yields elements with one wrong array each, and how the door refuses them."""
-    for part in PARTS:
+    """Yields elements, spoilt in one array each, and how the door refuses them."""
+    for name, place in WITHIN.items():
+        of = lambda part, place=place: functools.reduce(getattr, place.split("."), part)
+        part = elements.ALL[name]
+        spoilt_part = eqx.tree_at(of, part, -jnp.ones(3))
+        yield part, spoilt_part, rf"(forces\[0\]\.)?{place}: expected"
+    for part in ELEMENTS:
         for name, about in type(part).__dataclass_fields__.items():
             rules, value = about.metadata.get("rules"), getattr(part, name)
-            if not isinstance(part, fj.Element) or not rules or not eqx.is_array(value):
+            if not rules or not eqx.is_array(value):
                 continue
             wrong = [(lambda a: a * np.nan, "")]
-            if rules["minimum"] == 0:
-                wrong.append((lambda a: -1 - a, ".* at least 0"))
+            for bound, least in (("minimum", "at least"), ("above", "above")):
+                if rules[bound] == 0:
+                    wrong.append((lambda a: -1 - a, f".* {least} 0"))
             if rules["shape"] == ("joint",):
                 wrong.append((lambda a: jnp.ones(2), "numbers for 3 joints, .* got 2"))
             for change, words in wrong:
                 words = rf"forces\[0\]\.({name}|jump_ts): expected {words}"
-                yield spoilt(part, name, change), words
+                yield part, spoilt(part, name, change), words
 
 
+ELEMENTS = [part for part in PARTS if isinstance(part, fj.Element)]
+WITHIN = {"computed torque": "model.mass", "motor with PID": "command.pd.kd"}
 LAG, SHAPED = fj.control.FirstOrderLag(DAMPER, 0.1), np.zeros((1, 2, 3))
 FRICTION, STOPS = forces.JointFriction(0.4), forces.HardStops(-1, 1)
 BRAKE, MOVED = forces.Brake(1), fj.simulation.PrescribedMotion(1, hold)
@@ -341,14 +365,28 @@ FIG5, RRR = fj.scenes.fig5(), fj.scenes.circle_scenes()["RRR"]
 ONES, FIXED = np.ones((2, 3)), diffrax.ConstantStepSize()
 FLAT = tuple(ONES[:, :2])  # of two joints
 UNLIMITED = FIG7._replace(forces=(PD.replace(limit=np.full(3, np.inf)),))
-ERRORS = dict(loss=tuning.joint_errors)
 TWO, TWO_STARTS, SEEN = stacked(ARM), stacked(START), np.zeros((5, 3, 2))
 SHARED = "linkage, state0, forces"
 BARE = fj.Scene(ARM, START, (), 1.0)
+# Elements of chains of two or four joints
+PER_JOINT, FAR = "expected numbers for 3 joints, .*got 2", fj.Point(4, 0.1)
+AT_ZERO = references.SetPoint([0, 0])
+FOREIGN = [
+    acting(f"@.{words}", element) for words, element in (
+        (f"reference.q: {PER_JOINT}", PD.replace(reference=AT_ZERO)),
+        (f"command.tau: {PER_JOINT}", LAG.replace(command=fj.JointEffort([1, 2]))),
+        ("reference: .* 3 real numbers", PD.replace(reference=lambda *_: FLAT)),
+        ("b.link: expected 0 .* 1 to 3, got 4", fj.SpringDamper(fj.Point(0), FAR)),
+        ("point.link: expected 0 .* 1 to 3, got 4", fj.Wrench(FAR, [1, 0])),
+        ("model: expected the arm's own topology", fj.control.ComputedTorque(
+            1, 1, 1, hold, FIG5.linkage)),
+    )
+]  # fmt: skip
 MORE = {
     "Linkage": [
         ("length: .* 4 real numbers for the ground and 3 moving", dict(length=ONES)),
         ("com: .* 3x2 real numbers for 3 moving links", dict(com=ONES)),
+        ("mass: .* 3 real numbers for 3 moving links", dict(mass=ONES)),
         *((rf"{name}: .* at least 0, got \[", {name: [1, 1, -1]})
           for name in ("mass", "inertia")),
         *each("topology: .* 1 to 8 letters", "topology", "RXR", [0, 1j]),
@@ -356,6 +394,7 @@ MORE = {
         *each("topology: .* one real joint at most in each", "topology", [0, 1, 1, 1]),
     ],
     "simulate": [
+        *FOREIGN,
         ("rtol, atol, max_step: expected none beside a stepsize_controller",
          dict(rtol=1e-6, stepsize_controller=FIXED)),
         *((f"linkage.{named}", dict(linkage=spoilt(ARM, name, change)))
@@ -420,12 +459,10 @@ MORE = {
     "stacked": each(r"scenes\[1\]: expected one like scenes\[0\]", "scenes",
                     [FIG7, FIG5], [RRR, RRR._replace(forces=(*RRR.forces, DAMPER))]),
     "tune_within": [
-        (".* its controller to track a task with a `tip`", dict(scene=step(0.1))),
-        (r"limits.overshoot: .* for 1 joints", dict(
-            scene=step(0.1), limits=tuning.Limits([0.1, 0.1]), **ERRORS)),
-        ("scene: expected an equilibrium",
-         dict(scene=step(0.1, fj.JointEffort([1.0])), **ERRORS)),
-        ("forces.*: .* without a state", dict(scene=step(0.1, LAG), **ERRORS)),
+        *each(".* controller to track a task with a `tip`", "loss", tuning.Tracking()),
+        *each("limits.overshoot: .* for 1 joints", "limits", tuning.Limits([0.1, 0.1])),
+        *each("scene: expected an equil", "scene", step(0.1, fj.JointEffort([1.0]))),
+        *each("forces.*: .* without a state", "scene", step(0.1, LAG)),
     ],
     "fit": [
         *each(r"scene_at\(...\): expected a Scene", "scene_at", lambda p: p["a"]),
@@ -459,9 +496,9 @@ MORE = {
     "open_loop": [
         *each(r"joint: expected one of \(1, 2, 3\), got [04T]", "joint", 0, 4, True),
         *each("controller: expected one that", "controller", MOVED),
-        *each("controller: expected no element that holds", "controller", FRICTION),
     ],
     "from_chain": each("topology: expected no fixed pair", "topology", "RFR"),
+    "present": each("forces", "forces", *WRONG_BY_NAME["forces"][:-1]),
     "reachable": each("reference", "reference", LINE, HELD, lambda t, linkage: None),
     "tip_errors": each("scene", "scene", BARE._replace(forces=(HELD,))),
     "step": [acting("forces: expected elements without", LAG)],
@@ -474,6 +511,9 @@ MORE = {
         acting("solution.own: expected the states",
                fj.control.PIDController(1.0, 1.0, 1.0, 1.0, hold)),
     ],
+    "tip_position": [
+        (rf"linkage\.{name}: .* 3 pairs", dict(linkage=spoilt(ARM, name, seven)))
+        for name in ("com", "length", "mass")],
     "to_xarray": each("solution.ts: expected the same times", "solution",
                       spoilt(stacked(MOTION), "ts", lambda a: a.at[1].add(1.0))),
     "to_mjcf": [
@@ -522,6 +562,8 @@ MORE = {
          dict(level=[1, 2, 3], static=[1, 2])),
         ("static: expected none beside", dict(static=2, speed=1)),
     ],
+    **{name: each("model.mass: expected", "model", spoilt(ARM, "mass", lambda a: -a))
+       for name in ("GravityFeedforward", "ComputedTorque")},
     "HardStops": each("lower: expected less than upper", "lower", 9)
     + each("restitution: expected at most 1", "restitution", 1.1),
     "Payload": [
@@ -530,6 +572,7 @@ MORE = {
         ("velocity: expected zeros", dict(velocity=[1, 0], begin=None)),
         ("place: expected a point of a moving link", dict(place=fj.Point(0))),
     ],
+    "TipTask": each("path: expected a Path that .*`middle`.*got", "path", Nowhere()),
     "EffortHistory": each("ts: expected increasing", "ts", [0, 0, 1, 2], [])
     + each("tau: expected 4 rows", "tau", np.ones((3, 3))),
     "Pulse": [

@@ -84,9 +84,8 @@ def test_equations_of_peers_are_those_of_the_library():
         exact = np.asarray(fj.forward_dynamics(linkage, q, qd, np.zeros(n)))
         y = absolute(arm, q, qd)
         np.testing.assert_allclose(relative(arm, y), [q, qd], atol=1e-14)
-        found = [
-            np.diff(accelerations(arm, *y.reshape(2, n), np.sin, np.cos), prepend=0)
-        ]
+        turns = accelerations(arm, *y.reshape(2, n), np.sin, np.cos)
+        found = [np.diff(turns, prepend=0)]
         if linkage is arms[1]:  # in arrays
             rates = contestants._textbook_field(0, np.append(q, qd), (linkage, ()))
             found.append(rates[3:])
@@ -100,29 +99,20 @@ def strict(constant):
 
 @pytest.mark.slow
 def test_the_number_of_joints_is_measured_end_to_end(tmp_path):
-    command = [sys.executable, "-m", "benchmarks", "--quick"]
-    result = subprocess.run(
-        [*command, "--only", "joints", "--output", str(tmp_path)], cwd=ROOT,
-        env={**os.environ, "JAX_PLATFORMS": "cpu"}, capture_output=True, text=True,
-    )  # fmt: skip
+    options = "--quick", "--only", "joints", "--output", str(tmp_path)
+    command = [sys.executable, "-m", "benchmarks", *options]
+    env = os.environ | {"JAX_PLATFORMS": "cpu"}
+    result = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True)
     assert result.returncode == 0, result.stdout + result.stderr
     lines = (tmp_path / "joints.jsonl").read_text().splitlines()
     points = [json.loads(line, parse_constant=strict) for line in lines]
-    for point in points:
-        assert set(RECORD) <= set(point)
-        assert {"job", "versions", "cpu", "cores", "load", "commit"} <= set(point)
+    about = {"job", "versions", "cpu", "cores", "load", "commit"}
+    assert all({*RECORD} | about <= set(point) for point in points)
     own = [p for p in points if p["solver"] in ("fdof_jax", "fdof_jax sweep")]
     assert {p["batch"] for p in own} == {1, 16}
     assert all(p["status"] == "ok" and p["flops"] > 0 for p in own)
     assert min(p["error"] for p in own) < 1e-9
     assert "16 arms [s per s]" in result.stdout
-
-
-def test_a_page_is_of_one_commit():
-    point = {"cpu": "one", "date": "today", "versions": {}, "commit": "a"}
-    assert "commit a" in page.machine({"x": [point], "y": [point]})
-    with pytest.raises(ValueError, match="those of one commit"):
-        page.machine({"x": [point], "y": [point | {"commit": "b"}]})
 
 
 def test_ratios_are_those_of_rounds():
@@ -136,8 +126,11 @@ def test_ratios_are_those_of_rounds():
     assert page.ratio(ours, others, 1e-12) == "-"
 
 
-def test_the_page_is_that_of_the_results():
-    """Its numbers are drawn from `results`, which are those of one commit."""
+def test_the_page_is_that_of_the_results_of_one_commit():
+    point = {"cpu": "one", "date": "today", "versions": {}, "commit": "a"}
+    assert "commit a" in page.machine({"x": [point], "y": [point]})
+    with pytest.raises(ValueError, match="those of one commit"):
+        page.machine({"x": [point], "y": [point | {"commit": "b"}]})
     text = (ROOT / "benchmarks/README.md").read_text()
     assert page.filled(text, page.texts(load(ROOT / "benchmarks/results"))) == text
     assert text.count("\n") <= 200

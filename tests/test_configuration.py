@@ -44,13 +44,9 @@ print(json.dumps(dict(
 
 
 def run_application(cache, flags):
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", APPLICATION, cache],
-        env={**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    command = [sys.executable, "-W", "error", "-c", APPLICATION, cache]
+    env = os.environ | {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags}
+    done = subprocess.run(command, env=env, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 
@@ -62,12 +58,10 @@ def test_an_application(tmp_path):
     # Options add up.
     expected = f"{own} {configuration._FLAG}" if NEEDS_OPTION else own
     assert first["flags"] == expected
-    if NEEDS_OPTION:
-        ((message, file),) = first["late"]
+    assert len(first["late"]) == NEEDS_OPTION
+    for message, file in first["late"]:
         assert "configure: " in message and "JAX had started" in message
         assert file == "<string>"  # the line that calls it
-    else:
-        assert first["late"] == []
     (folder,) = cache.iterdir()
     assert folder.name == configuration._processor()
     programs = lambda: {p.name for p in folder.iterdir() if "atime" not in p.name}
@@ -108,12 +102,10 @@ def test_precision_alone_is_set(restored):
         assert settings() == restored | {"jax_enable_x64": x64}
 
 
+FOLDERS = "", 1, b"folder", "file/below", "~no-such-user/x", "gs://bucket", "closed"
 REFUSED = {
     "x64": ("True or False", [1, "yes", [True]]),
-    "cache": (
-        "a folder, True or False",
-        ["", 1, b"folder", "file/below", "~no-such-user/x", "gs://bucket", "closed"],
-    ),
+    "cache": ("a folder, True or False", FOLDERS),
 }
 
 
@@ -122,8 +114,7 @@ def test_refusals_change_nothing(name, restored, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("file").touch()
     closed = Path("closed") / configuration._processor()
-    closed.mkdir(parents=True)
-    closed.chmod(0o500)
+    closed.mkdir(0o500, parents=True)
     expected, values = REFUSED[name]
     for value in values:
         if value == "closed" and os.access(closed, os.W_OK):  # root may
@@ -135,15 +126,15 @@ def test_refusals_change_nothing(name, restored, tmp_path, monkeypatch):
         assert settings() == restored
 
 
-@pytest.mark.parametrize(
-    "system, variables, expected",
-    [
-        ("linux", {"XDG_CACHE_HOME": ""}, ".cache"),
-        ("linux", {"XDG_CACHE_HOME": "~/other"}, "other"),
-        ("darwin", {}, "Library/Caches"),
-        ("win32", {"LOCALAPPDATA": ""}, "AppData/Local"),
-    ],
-)
+CACHES = [
+    ("linux", {"XDG_CACHE_HOME": ""}, ".cache"),
+    ("linux", {"XDG_CACHE_HOME": "~/other"}, "other"),
+    ("darwin", {}, "Library/Caches"),
+    ("win32", {"LOCALAPPDATA": ""}, "AppData/Local"),
+]
+
+
+@pytest.mark.parametrize("system, variables, expected", CACHES)
 def test_the_users_cache_folder(system, variables, expected, monkeypatch, tmp_path):
     monkeypatch.setattr(sys, "platform", system)
     for name, value in {"HOME": str(tmp_path), **variables}.items():

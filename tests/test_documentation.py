@@ -48,26 +48,15 @@ def test_docstring(name):
 
 
 # Every name that a user may import, with its module unless that is `fdof_jax`.
-NAMES = [
-    *(name for name in fj.__all__ if not inspect.ismodule(getattr(fj, name))),
-    *(
-        f"{room.__name__.removeprefix('fdof_jax.')}.{name}"
-        for room in ROOMS
-        for name in room.__all__
-        if getattr(fj, name, None) is not getattr(room, name)
-    ),
-    *(
-        f"scenes.{name}"
-        for name, value in inspect.getmembers(fj.scenes, inspect.isfunction)
-        if value.__module__ == fj.scenes.__name__
-    ),
-    *(
-        f"{module.__name__.split('.')[-1]}.{name}"
-        for module in (drawing, plotting)
-        for name in module.__all__
-        if inspect.isfunction(getattr(module, name))
-    ),
-]  # fmt: skip
+NAMES = [name for name in fj.__all__ if not inspect.ismodule(getattr(fj, name))]
+NAMES += [
+    f"{module.__name__.split('.')[-1]}.{name}"
+    for module in (*ROOMS, scenes, drawing, plotting)
+    for name, value in inspect.getmembers(module, callable)
+    if name
+    in getattr(module, "__all__", [name] * (value.__module__ == scenes.__name__))
+    and getattr(fj, name, None) is not value
+]
 # Classes of results, and of their parts: the function that returns each.
 RETURNED_BY = dict(
     FitResult="fit", Efforts="joint_efforts", Frames="link_frames", End="simulate",
@@ -80,13 +69,12 @@ RETURNED_BY = dict(
 
 def examples():
     """Returns all code that tests run as examples: doctests and blocks of guides."""
-    sources = (ROOT / "fdof_jax").rglob("*.py")
-    lines = [
-        re.findall(r"^ *(?:>>>|\.\.\.) (.*)", p.read_text(), re.M) for p in sources
-    ]
-    guides = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
-    blocks = [re.findall(r"```python\n(.*?)```", p.read_text(), re.S) for p in guides]
-    return "\n".join(line for group in lines + blocks for line in group)
+    line, block = r"^ *(?:>>>|\.\.\.) (.*)", r"```python\n([\s\S]*?)```"
+    guides = ROOT / "README.md", *(ROOT / "docs").glob("*.md")
+    places = [(path, line) for path in (ROOT / "fdof_jax").rglob("*.py")]
+    places += [(path, block) for path in guides]
+    found = [re.findall(kind, path.read_text(), re.M) for path, kind in places]
+    return "\n".join(sum(found, []))
 
 
 def test_every_name_has_an_example():
@@ -94,9 +82,8 @@ def test_every_name_has_an_example():
     for name in NAMES:
         short = name.split(".")[-1]
         maker = RETURNED_BY.get(short, short)
-        assert re.search(
-            rf"\b(fj(\.[a-z]+)?|scenes|drawing|plotting)\.{maker}\b", ran
-        ), name
+        called = rf"\b(fj(\.[a-z]+)?|scenes|drawing|plotting)\.{maker}\b"
+        assert re.search(called, ran), name
         if short in RETURNED_BY:
             returned = inspect.signature(PUBLIC[maker]).return_annotation
             parts = map(str, returned.__annotations__.values())
@@ -105,8 +92,7 @@ def test_every_name_has_an_example():
 
 def test_every_name_has_a_place_in_the_reference():
     pages = "".join(path.read_text() for path in (ROOT / "docs" / "api").glob("*.md"))
-    listed = re.findall(r"^::: fdof_jax\.(\S+)$", pages, re.M)
-    assert sorted(listed) == sorted(NAMES)
+    assert sorted(re.findall(r"^::: fdof_jax\.(\S+)$", pages, re.M)) == sorted(NAMES)
 
 
 def test_names_in_guides_become_links():

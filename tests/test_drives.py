@@ -1,5 +1,6 @@
 """Servo drives: closed forms, limits, and the states that they integrate."""
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,6 +24,7 @@ def motor(volts, **options):
 
 
 def test_a_lag_is_an_exponential():
+    """It is told if it is not a number."""
     ts = np.linspace(0, 1, 11)
     solution = fj.simulate(WHEEL, STILL, ts, (LAG,))
     effort = solution.own[0].own
@@ -35,25 +37,28 @@ def test_a_lag_is_an_exponential():
     np.testing.assert_array_equal(started.own, np.full(3, 2.0))
     with pytest.raises(ValueError, match="solution.own: expected the states of"):
         fj.joint_efforts(WHEEL, (), solution)
-
-
-def test_a_state_that_is_not_a_number_is_told():
     own0 = jax.tree.map(lambda x: jnp.nan * x, (LAG.initial_state(WHEEL),))
-    ts = np.linspace(0, 1, 11)
-    solution = fj.simulate(WHEEL, STILL, ts, (LAG,), own0=own0, throw=False)
-    assert str(solution.outcome) == "not finite"
-    assert int(solution.stats["num_steps"]) < 100
+    lost = fj.simulate(WHEEL, STILL, ts, (LAG,), own0=own0, throw=False)
+    assert lost.outcome == "not finite" and lost.stats["num_steps"] < 100
+
+
+def test_a_condition_ends_a_motion_under_sampled_control():
+    """Between samples: q = t^2."""
+    ends = dict(until=lambda t, q, qd, linkage: q[0] - 0.04, rtol=1e-9, atol=1e-12)
+    pushed = WHEEL, STILL, fj.JointEffort([4.0]), 0.07, 4
+    motion = fj.simulate_sampled(*pushed, solver=diffrax.Tsit5(), **ends)
+    assert motion.ended and motion.tau.shape == (4, 1)
+    np.testing.assert_allclose([motion.end.t, *motion.end.qd], [0.2, 0.4], rtol=1e-9)
+    np.testing.assert_allclose(motion.q[:, 0], [0, 0.07**2, 0.14**2, np.nan, np.nan])
 
 
 @pytest.mark.slow
 def test_a_motor_reaches_its_current_and_its_speed():
     # L di/dt = v - R i - k n w, J dw/dt = k n i.
-    rates = np.array([[-2 / 0.5, -0.3 / 0.5], [0.3 / 2, 0]])
-    ts = np.linspace(0, 5, 21)
+    rates, ts = np.array([[-2 / 0.5, -0.3 / 0.5], [0.3 / 2, 0]]), np.linspace(0, 5, 21)
     steady = np.linalg.solve(rates, [-12 / 0.5, 0])
     exact = np.array([steady - expm(rates * t) @ steady for t in ts])
-    forces = (motor(12.0, inductance=0.5, gear=3.0),)
-    motion = fj.simulate(WHEEL, STILL, ts, forces)
+    motion = fj.simulate(WHEEL, STILL, ts, (motor(12.0, inductance=0.5, gear=3.0),))
     found = np.hstack([motion.own[0].own, motion.qd])
     np.testing.assert_allclose(found, exact, rtol=1e-6, atol=1e-6)
 

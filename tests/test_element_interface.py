@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from elements import ALL, HOLDING, PD, SHORT, arm
+from elements import PD, SHORT, arm
 
 import fdof_jax as fj
 from fdof_jax.forces.element import elements
@@ -89,8 +89,8 @@ RETURNED = [
     (lambda: fj.energy(ARM, ZERO, ZERO, (Unequal(),)), ONE_SHAPE),
     (lambda: effort_of(Lost(), ZERO), r"^forces\[0\]: .*rate .*state, f64\[3\], got "),
     (
-        lambda: fj.Wrench(fj.Point(3, 1.0), lambda t: ZERO)(0.0, ZERO, ZERO, ARM),
-        "^force: expected an array of 2 real numbers",
+        lambda: effort_of(fj.Wrench(fj.Point(3), lambda t: ZERO)),
+        r"force: .* 2 real num",
     ),
     (lambda: effort_of(lambda t, q, qd, linkage: np.sign(qd)), UNTRACED),
     (lambda: effort_of(lambda t, q, qd, linkage: q if t < 0.2 else qd), UNTRACED),
@@ -114,23 +114,22 @@ def test_jumps_are_passed_on():
     path = fj.TipTask(fj.references.Line([1, 0], [1, 1]), travel)
     drive = fj.control.FirstOrderLag(pd, 0.1)
     prescribed = fj.simulation.PrescribedMotion(1, move)
-    for part in (travel, move, path, pd, drive, prescribed):
+    for part in travel, move, path, pd, drive, prescribed:
         np.testing.assert_array_equal(part.jump_ts, [1, 3])
     assert PD.jump_ts is None and fj.JointDamper(1.0).jump_ts is None
 
 
 class Pushes(fj.Element):
-    """A force between times, which no field declares."""
+    """A force whose times no field declares."""
 
     jump_ts: list | tuple | np.ndarray
 
     def __call__(self, t, q, qd, linkage):
-        begin, end = self.jump_ts
-        return jnp.where((t >= begin) & (t < end), 2.0, 0.0) * jnp.ones_like(q)
+        return jnp.ones_like(q)
 
 
 def pushing(jump_ts):
-    push = lambda *arguments: Pushes([0.3, 0.7])(*arguments)
+    push = lambda t, q, qd, linkage: jnp.ones_like(q)
     push.jump_ts = jump_ts
     return push
 
@@ -250,20 +249,13 @@ def test_a_reference_of_one_s_own():
 # Copies
 
 
-def test_a_copy_is_equal_in_values_and_structure():
+def test_a_copy_is_equal_or_has_other_numbers():
+    """Elements are made again of their arguments for each file, too: test_files.py."""
     eight = fj.references.FigureEight([1.6, 0.4], [0.5, 0.3])
-    for part in (
-        *(ALL | HOLDING).values(),
-        fj.TipTask(eight, fj.references.Laps(period=4.0)),
-        fj.references.Spline([[0, 0], [1, 1], [2, 0]], closed=True),
-        fj.simulation.PrescribedMotion((1, 3), lambda t, linkage: 0),
-    ):
+    task = fj.TipTask(eight, fj.references.Laps(period=4.0))
+    for part in task, fj.simulation.PrescribedMotion((1, 3), lambda t, linkage: 0):
         assert eqx.tree_equal(part.replace(), part, typematch=True), part
-        in_numpy = jax.tree.map(jax.device_get, part)
-        assert eqx.tree_equal(in_numpy.replace(), part), part
-
-
-def test_a_copy_has_other_numbers_of_an_element():
+        assert eqx.tree_equal(jax.tree.map(jax.device_get, part).replace(), part), part
     spring = fj.SpringDamper(fj.Point(0), fj.Point(1, 1), stiffness=2, damping=3)
     stiff = spring.__replace__(stiffness=4.0, one_sided="cable")  # by `copy.replace`
     assert (float(stiff.stiffness), float(stiff.damping), int(stiff.side)) == (4, 3, 1)

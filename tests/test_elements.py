@@ -1,6 +1,4 @@
-"""Laws of all force elements: energy, derivatives and bounds."""
-
-import dataclasses
+"""Laws of all force elements: energy and derivatives."""
 
 import chains
 import elements
@@ -13,16 +11,15 @@ from modes import LOOPS
 
 import fdof_jax as fj
 from fdof_jax.mechanics.equations import zeros
-from fdof_jax.simulation.simulate import check_elements
 from fdof_jax.simulation.vector_field import Args, applied, initial_own, schedule_of
 
+pytestmark = pytest.mark.slow
 ARM = elements.arm("RPR")
-EVERY = elements.ALL | elements.HOLDING
 
 # Energy
 
 # Numbers without which elements keep the energy. That of an actuator adds energy: see
-# test_actuators.py.
+# test_points.py.
 LOSSES = {"coefficient", "level", "damping"}
 BETWEEN = fj.Point(1, 0.4, 0.1), elements.TIP  # of two links that move
 MORE = {
@@ -70,7 +67,6 @@ def balance(linkage, parts, q, qd, tau):
     )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("topology", [*fj.TOPOLOGIES, "RFP", "FPR"])
 def test_energy_is_kept_but_for_what_dampers_take(topology):
     arm, real = elements.arm(topology), chains.moving(topology)
@@ -150,7 +146,6 @@ def acts_of_all():
     return jax.jit(acts, **LOOPS)(ARM, forces, jnp.array(0.1), *start, 0.1)
 
 
-@pytest.mark.slow
 def test_slopes_in_all_numbers_equal_differences():
     """The reverse mode of a motion transposes these: see test_chain_motions.py."""
     states = len(initial_own(Args(ARM, elements.START.q, None, FORCES)))
@@ -179,30 +174,3 @@ def test_slopes_in_all_numbers_equal_differences():
     assert idle <= IDLE, idle - IDLE
     wrong = {n for n, e, s in zip(labels, error, size) if not e <= 1e-6 * s + 1e-7}
     assert not wrong
-
-
-# Bounds
-
-
-def bounded(element):
-    """Returns the names of the arrays that a value of -1 is out of bounds for."""
-    for declared in dataclasses.fields(element):
-        rules = declared.metadata.get("rules", {})
-        low = rules.get("minimum") is not None or rules.get("above") is not None
-        if low and getattr(element, declared.name) is not None:
-            yield declared.name
-
-
-@pytest.mark.parametrize("name", EVERY)
-def test_values_that_no_constructor_saw_are_told_where_they_are(name):
-    element, ts = EVERY[name], jnp.array([0.0, 0.1])
-    within = {"computed torque": "model.mass", "motor with PID": "command.pd.kd"}
-    places = [*bounded(element), *([within[name]] if name in within else [])]
-    possible = jax.jit(lambda e: e.possible())
-    assert possible(element)
-    for place in places:
-        where = lambda e, place=place: eval(f"e.{place}")
-        spoilt = eqx.tree_at(where, element, -1 - where(element))
-        with pytest.raises(ValueError, match=rf"^(forces\[0\]\.)?{place}.*: expected"):
-            check_elements((spoilt,), ARM, ts)
-        assert not possible(spoilt), place

@@ -30,18 +30,16 @@ def recorded(scene, observe=fj.identification.link_ends):
     return np.asarray(observe(scene, solution))
 
 
-def jacobian(scene_at, parameters):
-    """Returns central differences of `simulate` in each single number, (reading, n)."""
+def jacobian(readings, parameters, h=1e-4):
+    """Returns central differences of readings in each single number, (reading, n)."""
     columns = []
     for name, value in parameters.items():
         for index in np.ndindex(np.shape(value)):
             step = np.zeros(np.shape(value))
-            step[index] = 1e-4 * np.abs(np.asarray(value)[index])
-            moved = (
-                parameters | {name: jnp.asarray(value + s * step)} for s in (1, -1)
-            )
-            ahead, behind = (recorded(scene_at(changed)) for changed in moved)
-            columns.append((ahead - behind).ravel() / (2 * step[index]))
+            step[index] = h * np.abs(np.asarray(value)[index])
+            moved = (jnp.asarray(value + s * step) for s in (1, -1))
+            ends = (readings(parameters | {name: to}) for to in moved)
+            columns.append(np.subtract(*ends).ravel() / (2 * step[index]))
     return np.stack(columns, axis=1)
 
 
@@ -63,6 +61,7 @@ MIXED, OTHER = (
     Mixed(fj.State(jnp.array(q), jnp.zeros(3)))
     for q in ([-1.0, 0.3, 0.2], [0.1, 0.5, 0.5])
 )
+of_mixed, of_other = (lambda p, at=at: recorded(at(p)) for at in (MIXED, OTHER))
 TRUE = dict(mass=1.2, inertia=0.15, offset=-0.08, damping=[2.0, 3.0, 0.2])
 TRUE = {name: jnp.asarray(value) for name, value in TRUE.items()}
 FIRST = dict(mass=0.9, inertia=0.2, offset=-0.05, damping=[1.0, 1.0, 0.3])
@@ -76,7 +75,7 @@ def errors_of(result):
 @cache
 def clean():
     """Returns two motions of the same arm (recording, ...)."""
-    return np.stack([recorded(MIXED(TRUE)), recorded(OTHER(TRUE))])
+    return np.stack([of_mixed(TRUE), of_other(TRUE)])
 
 
 @cache
@@ -92,7 +91,7 @@ def test_the_parameters_are_as_exact_as_the_noise_lets_them_be():
     and one that drifts, which another motion tells.
     """
     noise, draws, seen = 1e-3, 50, clean()[0]
-    slopes, rng = jacobian(MIXED, TRUE), np.random.default_rng(0)
+    slopes, rng = jacobian(of_mixed, TRUE), np.random.default_rng(0)
     covariance_by = lambda rows: noise**2 * np.linalg.inv(rows.T @ rows)
     covariance = covariance_by(slopes)
     bound = np.sqrt(np.diag(covariance))
@@ -192,7 +191,7 @@ def test_a_fit_that_predicts_another_motion_to_its_noise(noise):
     assert found.usable and "not tested on held-out" in str(found).splitlines()[0]
     assert judged.usable and str(judged).startswith("No fault is known, on held-out")
     np.testing.assert_array_equal(judged.covariance, found.covariance)
-    predicted = recorded(OTHER(judged.parameters))
+    predicted = of_other(judged.parameters)
     error = np.sqrt(np.mean((predicted - noisy()[1]) ** 2)) / (noise or judged.noise)
     tolerance = 1e-4 if noise else 0.05
     np.testing.assert_allclose(judged.held_out, (error,), rtol=tolerance)
@@ -207,19 +206,15 @@ def test_a_fit_that_predicts_another_motion_to_its_noise(noise):
 def test_a_wrong_model_is_told_by_another_motion_alone():
     """Wrong by 7 % in one inertia, which the other parameters hide from the fit."""
     noise = 5e-3
-    (seen, other), draw = noisy(), np.random.default_rng(1)
-    seen, other = (
-        rows + noise * draw.normal(size=rows.shape) for rows in (seen, other)
-    )
+    draw = np.random.default_rng(1).normal(size=noisy().shape)
+    seen, other = noisy() + noise * draw
+    options = dict(bounds=dict(inertia=(0.16, 0.2)), noise=noise)
     alike, wrong = (
-        fj.fit(
-            MIXED, FIRST, TS, seen, bounds=dict(inertia=(0.16, 0.2)), noise=noise,
-            validate=held_out,
-        )
+        fj.fit(MIXED, FIRST, TS, seen, **options, validate=held_out)
         for held_out in ((MIXED, seen), (OTHER, other))
-    )  # fmt: skip
+    )
     assert alike.usable and wrong.converged and not wrong.usable
-    (fault,), matrix = wrong.faults, jacobian(OTHER, wrong.parameters)
+    (fault,), matrix = wrong.faults, jacobian(of_other, wrong.parameters)
     excess = np.sum(matrix @ wrong.covariance * matrix) / len(matrix)
     expected = np.sqrt(1 + excess / noise**2)
     assert f"exceed the noise ({expected:.3g} times the noise is expected" in fault
@@ -237,10 +232,52 @@ def test_angles_that_wrap_are_named():
 
     angle = (1 - np.exp(-0.5 * TS)) * 8 / 0.5
     wrapped = (angle + np.pi) % (2 * np.pi) - np.pi
-    remarks = []
-    for readings in (wrapped, np.unwrap(wrapped)):
+    for readings, wraps in (wrapped, True), (np.unwrap(wrapped), False):
         first = {"damping": 0.4}
         found = fj.fit(slowing, first, TS, readings[:, None], observe=encoders)
-        remarks.append((found.usable, "numpy.unwrap" in str(found)))
-    assert remarks == [(False, True), (True, False)]
+        assert (found.usable, "numpy.unwrap" in str(found)) == (not wraps, wraps)
     np.testing.assert_allclose(found.parameters["damping"], 0.5, rtol=1e-6)
+
+
+# A scene that holds joints
+
+RODS = fj.scenes.double_pendulum().linkage
+BENT = fj.State([0.3, -0.2], [0.0, 0.0])
+MOVE = fj.references.JointMove(BENT.q, [0.8, 0.6], fj.references.Travel(0.7))
+CONTROL = fj.PDController([200, 40], [20, 1], 100, MOVE)
+TIMES, NOISE = np.linspace(0, 1.5, 151), 1e-4
+
+
+def held_at(p):
+    level, static = (jnp.stack([0.0, p[name]]) for name in ("level", "static"))
+    friction = fj.forces.JointFriction(level, static)
+    ends = -np.inf, [np.inf, 0.1]
+    stops = fj.forces.HardStops(*ends, restitution=p["restitution"])
+    load = fj.forces.Payload(fj.Point(2, 0.8), p["mass"], begin=p["time"])
+    return fj.Scene(RODS, BENT, (CONTROL, friction, stops, load), 1.5)
+
+
+def seen_at(p):
+    motion = fj.simulate(held_at(p), TIMES, rtol=1e-13, atol=1e-13)
+    return fj.identification.link_ends(held_at(p), motion)
+
+
+@pytest.mark.slow
+def test_standard_errors_through_all_that_holds():
+    """Those from extrapolated differences of tight solves; the truth is within four."""
+    truth = dict(level=1.0, static=2.0, restitution=0.6, mass=0.4, time=0.25)
+    seen = seen_at(jax.tree.map(jnp.array, truth))
+    seen += NOISE * np.random.default_rng(0).normal(size=seen.shape)
+    start = dict(level=1.3, static=2.5, restitution=0.4, mass=0.5, time=0.28)
+    bounds = dict(restitution=(0.05, 0.95))
+    found = fj.fit(held_at, start, TIMES, seen, noise=NOISE, bounds=bounds)
+    assert found.usable
+    fine, coarse = (jacobian(seen_at, found.parameters, h) for h in (3e-5, 6e-5))
+    slopes = (4 * fine - coarse) / 3
+    right = NOISE * np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes)))
+    values, errors, true = (
+        np.array([of[name] for name in found.parameters])
+        for of in (found.parameters, found.standard_errors, truth)
+    )
+    np.testing.assert_allclose(errors, right, rtol=1e-4)
+    assert (np.abs(values - true) < 4 * errors).all()

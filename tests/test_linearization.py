@@ -13,6 +13,7 @@ from modes import LOOPS
 from test_reactions import ACTUATOR
 
 import fdof_jax as fj
+from fdof_jax.identification.result import inverse_and_null_space
 
 each_topology = pytest.mark.parametrize("topology", fj.TOPOLOGIES)
 STILL = np.zeros(3)
@@ -109,8 +110,9 @@ def test_equilibria_are_where_the_efforts_hold_the_arm(topology):
 def test_loads_that_nothing_holds_have_no_equilibrium():
     """A shoulder motor can be too weak or too strong for every posture."""
     for share in (0.95, 1.05):
-        tau = share * fj.analysis.holding_efforts(ROD, STILL)
-        q = fj.analysis.equilibrium(ROD, [0.4, 0.1, -0.1], (fj.JointEffort(tau),))
+        most = share * fj.analysis.holding_efforts(ROD, STILL)
+        pushing = fj.PDController([1e6] * 3, np.ones(3), most, Hold(np.full(3, 9.0)))
+        _, q = rest(ROD, pushing, jnp.array([0.4, 0.1, -0.1]))
         assert np.isfinite(q).all() == (share < 1)
 
 
@@ -118,13 +120,18 @@ def test_loads_that_nothing_holds_have_no_equilibrium():
 
 
 @pytest.mark.slow
-def test_longer_steps_than_the_longest_are_unstable():
+def test_longer_steps_than_the_longest_are_unstable_and_fixed_pairs_have_no_modes():
     growth = lambda z: np.abs(1 + z + z**2 / 2 + z**3 / 6 + z**4 / 24).max()
     for kd in (0.5, 40.0):
         forces = (held(ROD, STILL, [400.0, 300.0, 200.0], [kd] * 3),)
         modes = modes_at(ROD, forces, (STILL, STILL), (STILL, STILL))
         z = modes.longest_step[0] * modes.eigenvalues[0]
         assert (modes.damping > 0).all() and growth(z) < 1 < growth(1.15 * z)
+    linkage = ROD.replace(topology="RFR")
+    forces = (held(linkage, STILL, [400.0, 0.0, 200.0], [10.0, 0.0, 6.0]),)
+    modes = modes_at(linkage, forces, (STILL, STILL), (STILL * np.nan, STILL))
+    assert modes.eigenvalues.shape == (2, 4) and np.isnan(modes.longest_step[1])
+    assert modes.frequency[0].min() > 1 and (modes.damping[0] > 0).all()
 
 
 def test_a_saturated_joint_has_no_gains():
@@ -146,27 +153,29 @@ def test_a_saturated_joint_has_no_gains():
     np.testing.assert_allclose(modes.longest_step, 2.6 / modes.frequency[:, -1])
 
 
-@pytest.mark.slow
-def test_fixed_pairs_have_no_modes():
-    linkage = ROD.replace(topology="RFR")
-    forces = (held(linkage, STILL, [400.0, 0.0, 200.0], [10.0, 0.0, 6.0]),)
-    modes = modes_at(linkage, forces, (STILL, STILL), (STILL * np.nan, STILL))
-    assert modes.eigenvalues.shape == (2, 4) and np.isnan(modes.longest_step[1])
-    assert modes.frequency[0].min() > 1 and (modes.damping[0] > 0).all()
+DETERMINED = {"RPR": 9, "PRR": 7}
+
+
+@jax.jit
+@partial(jax.vmap, in_axes=(None, 0, 0, 0))
+def of_samples(*motion):
+    return fj.analysis.regressor(*motion), fj.inverse_dynamics(*motion)
 
 
 @each_topology
 def test_the_regressor_times_the_parameters_is_the_inverse_dynamics(topology):
-    """Of an RPR arm, nine combinations of the twelve parameters are identified."""
+    """Some combinations of the twelve parameters are identified."""
     linkage, *_ = random_motion(topology)
     samples = np.random.default_rng(1).uniform(-2, 2, (3, 40, 3))
-    along = lambda of: jax.vmap(of, (None, 0, 0, 0))(linkage, *samples)
-    matrix, parameters = (
-        along(fj.analysis.regressor),
-        fj.analysis.inertial_parameters(linkage),
-    )
-    tau = jnp.einsum("tjlp,lp->tj", matrix, parameters)
-    np.testing.assert_allclose(tau, along(fj.inverse_dynamics), rtol=1e-9, atol=1e-9)
-    if topology == "RPR":
-        values = np.linalg.svd(matrix.reshape(120, 12), compute_uv=False)
-        assert values[8] > 1e-3 * values[0] and values[9] < 1e-12 * values[0]
+    matrix, tau = of_samples(linkage, *samples)
+    found = np.einsum("tjlp,lp->tj", matrix, fj.analysis.inertial_parameters(linkage))
+    np.testing.assert_allclose(found, tau, rtol=1e-9, atol=1e-9)
+    rows = np.asarray(matrix).reshape(120, 12)
+    if count := DETERMINED.get(topology):
+        values = np.linalg.svd(rows, compute_uv=False)
+        assert values[count - 1] > 1e-3 * values[0]
+        assert values[count] < 1e-12 * values[0]
+        # Identification leaves the others as they are.
+        _, null = inverse_and_null_space(rows.T @ rows)
+        assert null.shape == (12, 12 - count)
+        np.testing.assert_allclose(rows @ null, 0, atol=1e-5 * values[0])

@@ -1,6 +1,7 @@
 """The package as users import it: what the names are, and what their import costs."""
 
 import ast
+import functools
 import graphlib
 import inspect
 import re
@@ -66,49 +67,78 @@ ROOMS = {
 }  # fmt: skip
 
 
+def leaf_of(place):
+    first, *_ = *place.relative_to(FOLDER).parts, ""
+    return LEAVES.get(first.removesuffix(".py"))
+
+
+@functools.cache
+def imports(path):
+    """Returns the file of each import of the library, and its names, if not itself."""
+    found = []
+    for line in ast.walk(ast.parse(path.read_text())):
+        if isinstance(line, ast.Import):
+            assert not any(n.name.startswith("fdof_jax") for n in line.names), path
+        elif isinstance(line, ast.ImportFrom):
+            module = line.module or ""
+            assert not module.startswith("fdof_jax"), path
+            if line.level:
+                place = path.parents[line.level - 1].joinpath(*module.split("."))
+                for name in (name.name for name in line.names):
+                    module = place / name
+                    alone = module.is_dir() or module.with_suffix(".py").exists()
+                    source, names = (module, set()) if alone else (place, {name})
+                    inside = source / "__init__.py" if source.is_dir() else ""
+                    found.append((Path(inside or f"{source}.py"), names))
+    return found
+
+
 def test_rooms_import_from_those_below_them_only():
+    room_of = lambda path: path.relative_to(FOLDER).with_suffix("").parts[0]
     for path in FOLDER.rglob("*.py"):
-        module = path.relative_to(FOLDER).with_suffix("").parts
-        for line in ast.parse(path.read_text()).body:
-            if not isinstance(line, ast.ImportFrom) or not line.level:
-                if isinstance(line, ast.Import) and line.names[0].name == "diffrax":
-                    assert module[0] in ("steps", "simulation", "batches"), path
-                continue
-            above = module[: len(module) - line.level]
-            room = (*above, *(line.module or line.names[0].name).split("."))[0]
-            if {room, module[0]} & {*LEAVES}:
-                continue
-            assert room == module[0] or ROOMS[room] < ROOMS[module[0]], path
+        room, others = room_of(path), {room_of(file) for file, _ in imports(path)}
+        if room not in LEAVES:
+            for other in others - {room, *LEAVES}:
+                assert ROOMS[other] < ROOMS[room], path
+        if re.search("^import diffrax", path.read_text(), re.M):
+            assert room in ("steps", "simulation", "batches"), path
 
 
 def test_no_modules_import_each_other():
     """Not within functions either, nor for their types; rooms show names of leaves."""
-    modules, graph = {*FOLDER.rglob("*.py")}, {}
-    of_leaf = lambda path: path.relative_to(FOLDER).with_suffix("").parts[0] in LEAVES
-    for path in modules:
-        for line in ast.walk(ast.parse(path.read_text())):
-            if isinstance(line, ast.ImportFrom) and line.level:
-                parts = line.module.split(".") if line.module else []
-                place = path.parents[line.level - 1].joinpath(*parts)
-                places = [place, *(place / name.name for name in line.names)]
-                files = [each.with_suffix(".py") for each in places]
-                found = {*files, *(each / "__init__.py" for each in places)} & modules
-                if not of_leaf(path):
-                    found = {each for each in found if not of_leaf(each)}
-                graph.setdefault(path, set()).update(found - {path})
+    graph = {
+        path: {
+            file for file, _ in imports(path)
+            if file != path and (leaf_of(path) or not leaf_of(file))
+        }
+        for path in FOLDER.rglob("*.py")
+    }  # fmt: skip
     assert sum(map(len, graph.values())) > 500
     graphlib.TopologicalSorter(graph).prepare()  # raises for a circle
 
 
-def imported(code):
-    """Returns the names of all modules that a new process has imported after `code`."""
-    command = [sys.executable, "-c", f"{code}; import sys; print(*sys.modules)"]
-    run = subprocess.run(command, capture_output=True, text=True, check=True)
-    return set(run.stdout.split())
+IMPORT = """
+import sys, warnings
+import jax
+from jax._src.xla_bridge import backends_are_initialized
+before = dict(jax.config.values)
+import fdof_jax as fj
+print(*sys.modules)
+assert not backends_are_initialized() and jax.config.values == before
+fj.configure(x64=True)
+assert fj.JointDamper(1.0).coefficient.dtype == "float64"
+warnings.simplefilter("ignore")
+fj.plotting
+assert "matplotlib" in sys.modules
+"""
 
 
-def test_the_import_takes_what_simulation_needs():
-    modules = imported("import fdof_jax")
+def test_the_import_takes_what_simulation_needs_and_starts_and_sets_nothing():
+    """JAX starts its devices at the first array, which `configure` must precede."""
+    command = [sys.executable, "-W", "error", "-c", IMPORT]
+    run = subprocess.run(command, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    modules = set(run.stdout.split())
     assert "diffrax" in modules
     # JAX and diffrax import none of these themselves.
     assert not modules & {
@@ -116,21 +146,6 @@ def test_the_import_takes_what_simulation_needs():
         "pandas", "scipy.interpolate", "scipy.linalg", "scipy.optimize", "xarray",
         "zarr",
     }  # fmt: skip
-    assert "matplotlib" in imported("import fdof_jax as fj; fj.plotting")
-
-
-def test_the_import_starts_nothing_and_sets_nothing():
-    """JAX starts its devices at the first array, which `configure` must precede."""
-    code = """
-import jax
-from jax._src.xla_bridge import backends_are_initialized
-before = dict(jax.config.values)
-import fdof_jax as fj
-assert not backends_are_initialized() and jax.config.values == before
-fj.configure(x64=True)
-assert fj.JointDamper(1.0).coefficient.dtype == "float64"
-"""
-    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)
 
 
 def test_versions_agree_wherever_they_are_written():
@@ -153,8 +168,7 @@ def test_messages_show_values_through_one_function():
 def test_each_fault_of_mutants_has_its_place():
     """`python tests/mutants.py` takes an hour: a name that changed shows here."""
     for name, mutant in MUTANTS.items():
-        text = (FOLDER / mutant.file).read_text()
-        assert text.count(mutant.old) == 1, name
+        assert (FOLDER / mutant.file).read_text().count(mutant.old) == 1, name
         file, _, test = mutant.check.partition("::")
         found = (
             not test or f"def {test.partition('[')[0]}(" in (ROOT / file).read_text()

@@ -1,7 +1,7 @@
-"""Springs, forces and wrenches at points of links: places, loads, times and sides.
+"""Springs, wrenches and actuators at points of links: places, loads, times and sides.
 
-Their energies are tested with those of all elements, in test_elements.py, and springs
-against MuJoCo's in test_mjcf_reading.py.
+That efforts follow from energies is tested in test_elements.py, and springs and
+armatures against MuJoCo's in test_mjcf_reading.py.
 """
 
 import equinox as eqx
@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import random_linkage, random_motion
+from helpers import random_motion
 
 import fdof_jax as fj
 from fdof_jax.linkage.frames import scalar_frames
@@ -53,10 +53,8 @@ def test_a_wrench_does_the_power_of_force_and_moment(topology, follows):
     linkage, q, qd = random_motion(topology)
     tip = fj.Point(3, linkage.length[3])
     wrench = fj.Wrench(tip, [3.0, -2.0], 1.5, follows=follows)
-    angle = fj.paper.to_chain(linkage, q, qd)[0][5]
-    force = (3 - 2j) * np.exp(1j * angle * follows)
-    jacobian = np.asarray(fj.tip_jacobian(linkage, q))
-    exact = jacobian.T @ [force.real, force.imag, 1.5]
+    force = (3 - 2j) * np.exp(1j * fj.paper.to_chain(linkage, q, qd)[0][5] * follows)
+    exact = np.asarray(fj.tip_jacobian(linkage, q)).T @ [force.real, force.imag, 1.5]
     np.testing.assert_allclose(effort(wrench, q, qd, linkage), exact, atol=1e-13)
     on_ground = wrench.replace(point=fj.Point(0, 1.0))
     np.testing.assert_array_equal(effort(on_ground, q, qd, linkage), 0)
@@ -86,11 +84,55 @@ def test_one_sided_springs(side, sign):
     assert np.abs(effort(held, q, -closing, linkage)).max() > 1
 
 
-def test_where_points_meet_forces_and_derivatives_are_finite():
-    linkage = random_linkage("RRR", np.random.default_rng(1))
+def test_where_points_meet_or_are_nowhere():
+    """Forces and derivatives are finite; a traced link may not be there."""
+    linkage, q, qd = random_motion("RRR")
     options = dict(stiffness=3.0, damping=1.0, rest_length=0.5)
     same = fj.SpringDamper(fj.Point(1), fj.Point(1), **options)
-    q, qd = np.array([0.1, 0.2, 0.3]), np.ones(3)
     np.testing.assert_array_equal(effort(same, q, qd, linkage), 0)
-    slope = jax.jacfwd(lambda q: effort(same, q, qd, linkage))(q)
-    assert np.isfinite(slope).all()
+    assert np.isfinite(jax.jacfwd(lambda q: effort(same, q, qd, linkage))(q)).all()
+    away = fj.SpringDamper(A, fj.Point(4, 0.1), stiffness=1)
+    assert np.isnan(
+        jax.jit(lambda s: s.potential_energy(jnp.asarray(q), linkage))(away)
+    )
+
+
+# Elements with inertia: energies and efforts of their bodies, written out
+
+PINS = fj.Point(0, -0.6, -0.8), fj.Point(2, 0.4, 0.3)
+ACTUATOR = fj.LinearActuator(
+    *PINS, force=5.0, mass=[1.2, 0.7], com=[0.2, 0.3], inertia=[0.05, 0.03]
+)
+
+
+def bodies(linkage, q):
+    """Returns mass centres of cylinder and piston, their direction and the length."""
+    x, _ = fj.paper.to_chain(linkage, q, np.zeros(3))
+    x = np.asarray(x)
+    turn = np.exp(1j * np.array([linkage.base_angle, *x[1::2]]))
+    start = np.cumsum((np.asarray(linkage.length)[:3] + 1j * x[0::2]) * turn[:3])
+    a, b = (-0.6 - 0.8j) * turn[0], start[1] + (0.4 + 0.3j) * turn[2]
+    unit = (b - a) / abs(b - a)
+    return np.array([a + 0.2 * unit, b - 0.3 * unit, unit, abs(b - a)])
+
+
+@pytest.mark.parametrize("topology", ["RRR", "PRP"])
+def test_the_actuator_s_energies_and_power(topology, h=1e-6):
+    linkage, q, qd = random_motion(topology)
+    at, *ends = (bodies(linkage, q + s * h * qd) for s in (0, 1, -1))
+    cylinder, piston, turn, stretch = np.subtract(*ends) / (2 * h)
+    kinetic = 1.2 * abs(cylinder) ** 2 + 0.7 * abs(piston) ** 2 + 0.08 * abs(turn) ** 2
+    potential = linkage.gravity * (1.2 * at[0] + 0.7 * at[1]).imag
+    bare, full = (fj.energy(linkage, q, qd, own) for own in ((), (ACTUATOR,)))
+    found = np.subtract(full, bare)
+    np.testing.assert_allclose(found, (kinetic / 2, potential), rtol=1e-7)
+    effort = np.asarray(ACTUATOR(0.0, q, qd, linkage))
+    np.testing.assert_allclose(effort @ qd, 5.0 * stretch.real, atol=1e-8)
+
+
+def test_the_actuator_s_force_may_depend_on_its_length():
+    linkage, q, qd = random_motion("RRR")
+    spring = fj.LinearActuator(*PINS, force=lambda t, length, rate: -30 * length - rate)
+    same = fj.SpringDamper(*PINS, stiffness=30.0, damping=1.0)
+    found, expected = (element(0.0, q, qd, linkage) for element in (spring, same))
+    np.testing.assert_allclose(found, expected, rtol=1e-12)

@@ -1,4 +1,4 @@
-"""References: tip paths and circles by inverse kinematics, and their reach."""
+"""References: profiles of motions, tip paths, circles by inverse kinematics, reach."""
 
 import chains
 import equinox as eqx
@@ -6,20 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from elements import SHORT
 from scipy.interpolate import CubicSpline
 
 import fdof_jax as fj
-from fdof_jax.references import (
-    Ellipse,
-    FigureEight,
-    Laps,
-    Line,
-    Spline,
-    Travel,
-    reach_margin,
-    reachable,
-)
+from fdof_jax.references import Ellipse, FigureEight, Laps, Line, Spline, Travel
+from fdof_jax.references.timing import PROFILES
 
 ARM = fj.Linkage(
     "RRR", length=[0, 1, 1, 0.3], com=[[0.5, 0]] * 3, mass=[1] * 3, inertia=[0.1] * 3
@@ -73,23 +64,13 @@ def test_a_tilt_is_counter_clockwise():
         np.testing.assert_allclose(path.point(first), [1, 2], atol=1e-15)
 
 
-@pytest.mark.parametrize("closed", [False, True])
-def test_a_spline_is_scipy_s(closed):
-    path = Spline(POINTS, closed=closed)
-    knots = np.linspace(0, 1, 5 if closed else 4)
-    points = np.vstack([POINTS, POINTS[:1]]) if closed else POINTS
-    exact = CubicSpline(knots, points, bc_type="periodic" if closed else "natural")
-    shares = np.linspace(0, 1, 41)
-    found = jax.jit(jax.vmap(path.point))(shares)
+@pytest.mark.parametrize("kind", ["natural", "periodic"])
+def test_a_spline_is_scipy_s(kind):
+    closed, shares = kind == "periodic", np.linspace(0, 1, 41)
+    points = np.vstack([POINTS, POINTS[: int(closed)]])
+    exact = CubicSpline(np.linspace(0, 1, len(points)), points, bc_type=kind)
+    found = jax.jit(jax.vmap(Spline(POINTS, closed=closed).point))(shares)
     np.testing.assert_allclose(found, exact(shares), atol=1e-13)
-
-
-def test_rounding_beside_the_negative_x_axis_adds_no_turn():
-    for side in (1e-13, -1e-13):
-        line = Line([-1.3, side], [-1.5, side])
-        q, _ = fj.TipTask(line, Travel(1.0), orientation=np.pi)(0.5, ARM)
-        np.testing.assert_allclose(q.sum(), np.pi, rtol=1e-6)
-        assert q[0] > 0
 
 
 # Circles
@@ -161,7 +142,7 @@ def within_reach(arm, circle, ts):
         at = circle.tip(t), circle.orientation
         return jnp.isfinite(fj.inverse_kinematics(arm, *at, branch=circle.branch)).all()
 
-    return reachable(arm, circle, ts), jax.vmap(solved)(ts)
+    return fj.references.reachable(arm, circle, ts), jax.vmap(solved)(ts)
 
 
 @pytest.mark.slow
@@ -176,7 +157,7 @@ def test_a_circle_is_reachable_where_inverse_kinematics_find_the_joints(topology
         found, within = within_reach(arm, circle, ts)
         np.testing.assert_array_equal(found, within)
         some += within.any() and not within.all()
-    np.testing.assert_array_equal(reachable(arm, circle, ts), within)
+    np.testing.assert_array_equal(fj.references.reachable(arm, circle, ts), within)
     assert some or topology.count("P") == 2  # of which none is out of reach
 
 
@@ -186,14 +167,15 @@ def test_a_circle_is_reachable_where_inverse_kinematics_find_the_joints(topology
 def test_margins_of_the_reach_and_their_derivatives():
     line = Line([2.5, 0], [3.5, 0])  # the last link points along it
     task, ts = fj.TipTask(line, Travel(1.0)), [0.0, 0.5, 1.0]
-    margin = lambda length: reach_margin(ARM.replace(length=length), task, ts)
+    margin_of = lambda arm: fj.references.reach_margin(arm, task, ts)
+    margin = lambda length: margin_of(ARM.replace(length=length))
     lengths = jnp.array([0.0, 1.0, 1.2, 0.8])
     np.testing.assert_allclose(margin(lengths), [0.5, 0, -0.5], atol=1e-15)
     slopes = jax.jit(jax.jacfwd(margin))(lengths)
     np.testing.assert_allclose(slopes, np.ones((3, 4)), atol=1e-15)
     # Two slides reach everywhere.
     slides = ARM.replace(topology="RPP", locked=[0, 0.5, 0])
-    np.testing.assert_array_equal(reach_margin(slides, task, ts), np.inf)
+    np.testing.assert_array_equal(margin_of(slides), np.inf)
 
 
 class Ramp(eqx.Module):
@@ -249,7 +231,8 @@ MOMENT = Spline([[1, 0], [2.5, 0], [1, 0.1]])  # out of reach for a moment
 def test_paths_are_checked_over_the_time_of_the_run(path, timing, bad, good, words):
     """By an error, also within transformations; where they are traced, as data."""
     task = fj.TipTask(path, timing)
-    fits = jax.jit(lambda ts: task.fits(ARM, ts) & reachable(ARM, task, ts).all())
+    within = lambda ts: fj.references.reachable(ARM, task, ts).all()
+    fits = jax.jit(lambda ts: task.fits(ARM, ts) & within(ts))
     if bad is not None:
         bad = np.array(bad, float)
         with pytest.raises(ValueError, match=words):
@@ -261,34 +244,13 @@ def test_paths_are_checked_over_the_time_of_the_run(path, timing, bad, good, wor
         assert fits(good)
 
 
-@pytest.mark.slow
-def test_a_motion_whose_reference_leaves_the_reach_says_so():
-    line = fj.TipTask(Line([1, 0], [9, 0]), lambda t: 10 * t)
-    pd, start = fj.PDController(10.0, 1.0, 50.0, line), fj.State(*np.zeros((2, 3)))
-    with pytest.raises(ValueError, match=rf"forces\[0\]\.reference: .*{BEYOND}"):
-        fj.simulate(ARM, start, [0, 0.1], (pd,), **SHORT)
-
-
-def test_a_path_without_middle_is_refused():
-    class Nowhere(fj.references.Path):
-        def point(self, share):
-            return jnp.stack([share, share])
-
-    with pytest.raises(ValueError, match="^path: expected a Path that .*`middle`.*got"):
-        fj.TipTask(Nowhere(), Laps(1.0))
-
-
-def test_branches_are_plus_or_minus_one_in_numbers_of_any_kind():
-    solve = lambda side: fj.inverse_kinematics(ARM, [1, 1], 0.0, branch=side)
-    for call in solve, lambda side: fj.CircleTask(branch=side):
-        for branch in (0, -1.5, "1", True, np.nan, [1]):
-            with pytest.raises(ValueError, match="^branch: expected .+, got .+"):
-                call(branch)
-        for branch in (1, -1.0, np.int64(-1), np.float32(1), jnp.array(1)):
-            call(branch)
-
-
-def test_what_a_task_commands_out_of_reach_is_refused_or_nan():
+def test_a_line_beside_the_negative_x_axis_and_one_out_of_reach():
+    """Rounding adds no turn; what a task commands is refused or NaN."""
+    for side in (1e-13, -1e-13):
+        line = Line([-1.3, side], [-1.5, side])
+        q, _ = fj.TipTask(line, Travel(1.0), orientation=np.pi)(0.5, ARM)
+        np.testing.assert_allclose(q.sum(), np.pi, rtol=1e-6)
+        assert q[0] > 0
     task = fj.TipTask(Line([1, 1], [9, 9]), lambda t: t, branch=-1)
     words = r"^t: .* 0 rad on branch -1.* got 1 s, .*\[9, 9\] m, beyond it by [0-9.]+ m"
     with pytest.raises(ValueError, match=words):
@@ -296,19 +258,78 @@ def test_what_a_task_commands_out_of_reach_is_refused_or_nan():
     assert np.isnan(jax.jit(lambda t: task(t, ARM))(1.0)).any()
 
 
-@pytest.mark.parametrize(
-    "edge, circle",
-    [
-        # The wrist comes within 0.4 m of the base, between samples of the circle.
-        (0.5, lambda r: fj.CircleTask([1.2, 0], r, 5.0, np.pi / 256, 0.0)),
-        # The arm reaches 1.6 m; the circle touches that edge at one point.
-        (0.5, lambda r: fj.CircleTask([1.4, 0], r, 5.0, 0.123, 0.0)),
-    ],
-)
-def test_circles_are_refused_for_their_nearest_or_farthest_point_alone(edge, circle):
+@pytest.mark.parametrize("at, phase", [(1.2, np.pi / 256), (1.4, 0.123)])
+def test_circles_are_refused_for_their_nearest_or_farthest_point_alone(at, phase):
+    """The wrist comes within 0.4 m of the base, or the tip 1.6 m away."""
     arm = ARM.replace(length=[0, 1, 0.6, 0.3])
+    circle = lambda radius: fj.CircleTask([at, 0], radius, 5.0, phase, 0.0)
     for begin in (0.0, 1.3):
         ts = np.array([begin, begin + 5])
-        circle(edge - 1e-7).check(arm, ts)
+        circle(0.5 - 1e-7).check(arm, ts)
         with pytest.raises(ValueError, match="^reference: expected a circle within"):
-            circle(edge + 1e-7).check(arm, ts)
+            circle(0.5 + 1e-7).check(arm, ts)
+
+
+# Profiles of point-to-point motions, and the shock against residual vibration
+
+
+@jax.jit
+def _derivatives(travel, times):
+    rate = jax.grad(travel)
+    return [jax.vmap(f)(times) for f in (travel, rate, jax.grad(rate))]
+
+
+def derivatives(travel, times=np.linspace(0, 3, 1201)):
+    """Returns the way, its rate and its second derivative."""
+    return map(np.asarray, _derivatives(travel, times))
+
+
+# The largest speed and acceleration, in units of the way per duration, and squared.
+LARGEST = {
+    "harmonic": (np.pi / 2, np.pi**2 / 2),
+    "cycloidal": (2.0, 2 * np.pi),
+    "quintic": (15 / 8, 10 / np.sqrt(3)),
+    "trapezoidal": (4 / 3, 16 / 3),
+}
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_a_profile_leads_from_start_to_end_and_rests_there(profile):
+    """Steps end where its acceleration jumps; a quintic's does not."""
+    travel, times = Travel(2.0, begin=0.5, profile=profile), np.linspace(0, 3, 1201)
+    way, rate, second = derivatives(travel, times)
+    before, after = times < 0.5, times >= 2.5
+    assert (way[before] == 0).all() and (way[after] == 1).all()
+    assert (rate[before] == 0).all() and (rate[after] == 0).all()
+    assert abs(rate[200]) < 1e-16 and (np.diff(way[200:1001]) > 0).all()
+    np.testing.assert_allclose(way[200:1001] + way[1000:199:-1], 1, atol=1e-14)
+    speed, acceleration = LARGEST[profile]
+    assert rate.max() == pytest.approx(speed / 2, rel=1e-3)
+    assert np.abs(second).max() == pytest.approx(acceleration / 4, rel=1e-2)
+    inside = [1.0, 2.0] if profile == "trapezoidal" else []
+    np.testing.assert_allclose(travel.jump_ts, [0.5, *inside, 2.5], rtol=1e-15)
+    jumps = times[1:][np.abs(np.diff(second)) > 0.3]
+    expected = travel.jump_ts if profile in ("harmonic", "trapezoidal") else []
+    np.testing.assert_allclose(jumps, expected, atol=0.003)
+
+
+@pytest.mark.parametrize("frequency", [2.0, 7.0])
+def test_the_shock_takes_the_load_s_frequency_out(frequency):
+    """A load on a spring follows x'' + w^2 x = -a; its integral is in closed form.
+
+    The velocity then jumps at both ends.
+    """
+    plain = Travel(1.5, profile="harmonic")
+    turn = frequency * 1.5
+    content = np.cos(turn / 2) / (1 - (turn / np.pi) ** 2)
+    shock = content / (content - np.sin(turn / 2) / (turn / 2))
+    times = (np.arange(20_000) + 0.5) * 1.5 / 20_000
+    wave, residual = np.exp(1j * frequency * times), []
+    for travel in (plain, plain.replace(shock=shock)):
+        way, rate, _ = derivatives(
+            travel, np.append(times, [0, -1e-9, 1.5, 1.5 - 1e-9])
+        )
+        residual.append(abs(np.mean(rate[:-4] * wave)))
+    assert residual[0] > 1e-3 and residual[1] < 1e-8
+    np.testing.assert_allclose(rate[-4:], [shock / 1.5, 0, 0, shock / 1.5], atol=1e-8)
+    assert way[-2] == 1

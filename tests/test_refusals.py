@@ -5,6 +5,8 @@ import warnings
 from functools import partial
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ import refusals
 import fdof_jax as fj
 from fdof_jax.simulation.simulate import check_elements
 from fdof_jax.tuning import search
+from fdof_jax.tuning.losses import residuals_of
 
 CALLABLES = refusals.callables()
 
@@ -82,18 +85,29 @@ def test_what_resists_and_sizes_are_declared_to_be_at_least_zero():
 
 
 def test_the_door_checks_what_a_constructor_has_not_seen():
+    """Programs, which know no values, ask whether they are possible."""
     check = partial(check_elements, linkage=refusals.ARM, ts=refusals.TS)
-    for element, words in refusals.past_constructors():
-        assert not fault(lambda: check((element,)), words), element  # noqa: B023
+    # One program for all of them, of which one is spoilt at a time.
+    possible = eqx.filter_jit(lambda parts: jnp.stack([p.possible() for p in parts]))
+    sound = refusals.ELEMENTS
+    assert possible(sound).all()
+    for part, spoilt, words in refusals.past_constructors():
+        assert not fault(partial(check, (spoilt,)), words), spoilt
+        if "joints" not in words:  # of other numbers of them
+            found = possible([spoilt if one is part else one for one in sound])
+            assert found.sum() == len(sound) - 1, spoilt
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(n, marks=[pytest.mark.slow] * (n in refusals.SLOW))
-        for n in refusals.MORE
-    ],
-)
+def test_a_program_knows_elements_of_another_chain():
+    for words, changes, *_ in refusals.FOREIGN:
+        run = lambda q: fj.simulate(refusals.ARM, (q, q), [0, 1], **changes)  # noqa: B023
+        assert not fault(partial(jax.eval_shape, run, np.zeros(3)), words), words
+
+
+@pytest.mark.parametrize("name", [
+    pytest.param(n, marks=[pytest.mark.slow] * (n in refusals.SLOW))
+    for n in refusals.MORE
+])  # fmt: skip
 def test_what_no_declaration_tells(name, refuses):
     refuses(name, refusals.MORE[name])
 
@@ -106,6 +120,20 @@ def test_traced_values_where_known_ones_are_needed(name):
     )
 
 
+def test_a_loss_that_is_negative_is_refused(monkeypatch):
+    """As its root is not a number, whatever the motion is."""
+    loss = lambda scene, motion: -1.0 - motion.q[-1, 0] ** 2
+
+    def evaluated(evaluate, z, *_):
+        value = np.sum(residuals_of(loss, refusals.FIG7, refusals.MOTION) ** 2)
+        rows = np.full(len(z), value), 0 * z, z[:, None] * z[..., None]
+        return search.Evaluation(*rows, {"simulated": np.ones(len(z), bool)})
+
+    monkeypatch.setattr(search, "_evaluate", evaluated)
+    call = lambda: fj.tune(refusals.FIG7, loss=loss)
+    assert not fault(call, "loss: .*one number that is not negative, with finite deriv")
+
+
 @pytest.mark.parametrize("kind", [np.float16, ">f8", np.int8, np.uint64])
 def test_real_numbers_of_any_type_are_taken(kind):
     ones = np.ones(3).astype(kind)
@@ -113,6 +141,8 @@ def test_real_numbers_of_any_type_are_taken(kind):
     damper, tip = fj.JointDamper(ones), fj.tip_position(arm, ones)
     for found in arm.mass, arm.gravity, damper.coefficient, tip:
         assert found.dtype == float
+    assert fj.CircleTask(branch=ones[0]).branch == 1
+    fj.inverse_kinematics(refusals.ARM, [-4, 2], 1.6, branch=ones[0])
 
 
 @pytest.mark.parametrize("hold", [list, tuple, lambda x: [fj.State(x, x)]])

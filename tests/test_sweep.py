@@ -6,6 +6,7 @@ import os
 import socket
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -90,10 +91,8 @@ def assert_alike(tree, other):
 
 def test_members_equal_single_simulations(batch, clean):
     """Equality of vmap with single motions is in test_one_compilation.py."""
-    simulate = lambda linkage, state0, forces: fj.simulate(
-        linkage, state0, TS, forces, throw=False, **SETTINGS
-    )
-    assert_alike(clean, jax.eval_shape(jax.vmap(simulate), *batch))
+    single = jax.vmap(functools.partial(alone, jax.tree.map(jnp.asarray, batch)))
+    assert_alike(clean, jax.eval_shape(single, jnp.arange(len(clean.q))))
     assert (clean.outcome == "successful").all()
     for member in range(len(clean.q)):
         single = alone(batch, member)
@@ -110,6 +109,8 @@ def test_members_that_fail_harm_no_other(mixed, swept, clean):
     expected = np.full(len(clean.q), "successful", object)
     expected[FAILED] = "not finite", "not finite", "out of steps"
     np.testing.assert_array_equal(swept.outcome, expected)
+    with pytest.raises(RuntimeError, match=r"3 of 42 members failed.* member 3\."):
+        run(mixed, throw=True)
     for member in (nan_later, spent):  # alone, a start of NaN is refused
         assert alone(mixed, member).outcome == expected[member]
     assert np.isnan(swept.q[nan_start]).all() and np.isnan(swept.q[spent][-1]).all()
@@ -148,8 +149,6 @@ def test_a_reduction_sees_each_member_and_its_motion(mixed, swept):
     assert_alike(reduced, expected)
     for a, b in zip(*map(jax.tree.leaves, (reduced, expected))):
         np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-8)
-    with pytest.raises(RuntimeError, match=r"3 of 42 members failed.* member 3\."):
-        run(mixed, reduce=figures_of, throw=True)
 
 
 def ramp(t, linkage):
@@ -165,8 +164,7 @@ def test_arrays_without_the_axis_are_shared():
     own = jax.tree.map(lambda a: np.stack([a] * 3) if eqx.is_array(a) else a, pd)
     forces = DAMPER, eqx.tree_at(lambda pd: pd.kp, own, kp), pd
     axes = None, 0, None
-    start = fj.State(q, [1])
-    motion = fj.sweep(PENDULUM, start, ts, forces, forces_axes=axes, **SHORT)
+    motion = fj.sweep(PENDULUM, fj.State(q, [1]), ts, forces, forces_axes=axes, **SHORT)
     ts[:] = 0  # the motion keeps its own, once for all members
     assert motion.ts.strides[0] == 0
     np.testing.assert_array_equal(motion.ts, np.tile(TS, (3, 1)))
@@ -217,14 +215,6 @@ def test_what_a_transformation_cannot_do_is_refused(batch, tmp_path):
     for options in dict(throw=True), dict(store=tmp_path):
         with pytest.raises(ValueError, match="^throw, store: expected"):
             jax.eval_shape(functools.partial(end, **options), state0.q)
-
-
-def test_under_a_transfer_guard(batch, monkeypatch):
-    """No array may reach or leave JAX unasked, in any thread."""
-    monkeypatch.setattr(devices, "cores", lambda: 2)
-    with setting("jax_transfer_guard", "disallow"):
-        motions, motion = run(batch), fj.simulate(PENDULUM, ([0.0], [0.0]), TS)
-    assert (motions.outcome == "successful").all() and motion.outcome == "successful"
 
 
 # Chunks
@@ -309,13 +299,17 @@ def test_progress_rises_to_one_and_other_values_need_no_new_trace(mixed, swept, 
 # Cores, devices and precision
 
 
-@pytest.mark.slow
 def test_cores_change_nothing(batch, clean, monkeypatch):
-    """Chunks are the same ones, whatever the number of threads that send them."""
+    """Chunks are the same ones, whatever the number of threads that send them.
+
+    No array may reach or leave JAX unasked, in any thread.
+    """
     for cores in (1, 3):
         monkeypatch.setattr(devices, "cores", lambda cores=cores: cores)
-        motion = run(batch)
-        for a, b in zip(*map(jax.tree.leaves, (motion, clean))):
+        with setting("jax_transfer_guard", "disallow"):
+            motions, motion = run(batch), fj.simulate(PENDULUM, ([0.0], [0.0]), TS)
+        assert motion.outcome == "successful"
+        for a, b in zip(*map(jax.tree.leaves, (motions, clean))):
             np.testing.assert_array_equal(a, b)
 
 
@@ -404,26 +398,17 @@ def test_more_devices_and_processes_change_nothing(batch, tmp_path):
         port.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{port.getsockname()[1]}"
     here = Path(__file__).parent
-    environment = os.environ | dict(
-        JAX_PLATFORMS="cpu",
-        JAX_NUM_CPU_DEVICES="2",
-        PYTHONPATH=os.pathsep.join([str(here), str(here.parent)]),
-    )
-    workers = [
-        subprocess.Popen(
-            [sys.executable, "-c", WORKER, address, str(index), str(tmp_path)],
-            env=environment,
-            stderr=subprocess.PIPE,
-        )
-        for index in range(2)
-    ]
-    try:
-        for worker in workers:
-            _, errors = worker.communicate(timeout=600)
-            assert worker.returncode == 0, errors.decode()[-3000:]
-    finally:
-        for worker in workers:
-            worker.kill()
+    places = os.pathsep.join([str(here), str(here.parent)])
+    own = dict(JAX_PLATFORMS="cpu", JAX_NUM_CPU_DEVICES="2", PYTHONPATH=places)
+
+    def work(index):
+        command = [sys.executable, "-c", WORKER, address, str(index), str(tmp_path)]
+        options = dict(env=os.environ | own, capture_output=True, text=True)
+        return subprocess.run(command, **options, timeout=600)
+
+    with ThreadPoolExecutor(2) as pool:
+        for done in pool.map(work, range(2)):
+            assert done.returncode == 0, done.stderr[-3000:]
     expected = run(batch, **SHORT)
     close = functools.partial(np.testing.assert_allclose, rtol=1e-12, atol=1e-12)
     for index in range(2):

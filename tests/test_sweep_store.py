@@ -139,21 +139,18 @@ def test_a_folder_in_the_place_of_a_file(mixed, stored, solved, name):
 
 
 @pytest.mark.parametrize("written", [0, 12, 30])
-def test_a_run_that_ends_early(
-    mixed, undisturbed, solved, tmp_path, monkeypatch, written
-):
-    original, count = os.replace, []
+def test_a_run_that_ends_early(mixed, undisturbed, solved, tmp_path, written):
+    replace, left = os.replace, iter(range(written))
 
-    def stop(*names):
-        count.append(names)
-        if len(count) > written:
+    def until_full(*names):
+        if next(left, None) is None:
             raise OSError("the disk is full")
-        original(*names)
+        replace(*names)
 
-    monkeypatch.setattr(os, "replace", stop)
-    with pytest.raises(OSError, match="the disk is full"):
-        run(mixed, store=tmp_path)
-    monkeypatch.setattr(os, "replace", original)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "replace", until_full)
+        with pytest.raises(OSError, match="the disk is full"):
+            run(mixed, store=tmp_path)
     # As a process leaves them that is killed
     for folder in [tmp_path, *filter(Path.is_dir, tmp_path.rglob("*"))]:
         (folder / "0.1.partial").write_text("{")
@@ -222,14 +219,11 @@ def test_what_others_wrote_is_refused_and_kept(mixed, tmp_path):
         opened(mixed, folder, like)
 
 
-def test_names_of_parts_differ_in_letters(mixed, tmp_path):
+def test_refusals_come_before_anything_is_traced(mixed, tmp_path, monkeypatch):
     q = np.zeros(3)
     for like in ({"a b": q, "a.b": q}, {"a": q, "A": q}, {"Failed": q}):
         with pytest.raises(ValueError, match="^reduce: expected .*name"):
             opened(mixed, tmp_path, like)
-
-
-def test_refusals_come_before_anything_is_traced(mixed, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("kept")
     with monkeypatch.context() as patch:

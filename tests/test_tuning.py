@@ -105,9 +105,8 @@ def test_reports_and_texts_say_what_happened():
 
 def test_starts_that_fail_are_counted():
     scene = circle(t1=0.2)
-    gains = gains_of(scene)
-    bounds = (gains, gains * 1e100)  # so stiff that the first steps fail
-    result = fj.tune(scene, bounds=bounds, starts=6, max_steps=1)
+    gains = gains_of(scene)  # at most so stiff that the first steps fail
+    result = fj.tune(scene, bounds=(gains, gains * 1e100), starts=6, max_steps=1)
     failed = np.isnan(result.losses).sum()
     assert failed and f"{failed} of 6 starts could not be simulated" in str(result)
     assert np.isfinite(result.loss)

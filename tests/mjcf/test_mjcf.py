@@ -30,10 +30,7 @@ def test_accelerations_energies_and_tips_equal_mujoco(topology):
 
 
 def test_massless_tip_is_passed_as_the_smallest_that_mujoco_takes():
-    linkage = fj.Linkage(
-        "RRR", length=[0, 1, 1, 1], com=[[0.5, 0]] * 3, mass=[1, 1, 0],
-        inertia=[0.1, 0.1, 0.1],
-    )  # fmt: skip
+    linkage = random_linkage("RRR", np.random.default_rng(0)).replace(mass=[1, 1, 0])
     model, data = in_mujoco(fj.to_mjcf(linkage))
     assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
     assert model.opt.timestep == 1e-3 and model.body("link3").mass == 1e-15
@@ -46,13 +43,12 @@ def everything(rng, n, servo):
     positive = lambda: rng.uniform(0.1, 2, size=n)
     points = fj.Point(0, 0.3, -0.9), fj.Point(n, 0.2, 0.1)
     spring = lambda **rest: fj.SpringDamper(*points, stiffness=3.0, **rest)
+    ends = np.append(-np.inf, np.full(n - 1, -50.5)), np.full(n, 60.5)
     parts = [
         fj.JointDamper(positive()),
         fj.forces.Armature(positive()),
         fj.forces.JointSpring(positive(), rng.normal(size=n)),
-        fj.forces.JointStops(
-            np.append(-np.inf, np.full(n - 1, -50.5)), np.full(n, 60.5)
-        ),
+        fj.forces.JointStops(*ends),
         fj.forces.JointFriction(positive()),
         spring(damping=0.3, rest_length=0.4),
         spring(rest_length=0.4, one_sided="cable"),
@@ -84,8 +80,8 @@ def test_what_is_written_is_read(kinds, servo):
     again = fj.from_mjcf(fj.to_mjcf(arm, forces, start))
     equal(again.state0, np.array(start)[:, moves], 1e-15)
     (stops,) = (f for f in again.forces if isinstance(f, fj.forces.JointStops))
-    for ends in zip((stops.lower, stops.upper), (forces[3].lower, forces[3].upper)):
-        equal(ends[0], ends[1][moves])
+    for name in ("lower", "upper"):
+        equal(getattr(stops, name), getattr(forces[3], name)[moves])
     q, qd = rng.normal(size=(2, 2, n)) * moves
     expected = rates(arm, forces, q, qd, None)[0][:, moves]
     found = rates(again.linkage, again.forces, q[:, moves], qd[:, moves], None)[0]
@@ -94,7 +90,8 @@ def test_what_is_written_is_read(kinds, servo):
     equal(*tips, 1e-12)
 
 
-def test_a_scene_is_written_whole():
+def test_a_scene_is_written_whole_and_limits_of_one_joint_leave_others_free():
+    """A limited joint beside a motor; gains of 0; both come back."""
     scene = fj.scenes.fig7()
     again = fj.from_mjcf(fj.to_mjcf(scene))
     (pd,), (expected,) = again.forces, scene.forces
@@ -103,6 +100,15 @@ def test_a_scene_is_written_whole():
         equal(getattr(pd, name), getattr(expected, name))
     start = lambda pd: np.array(pd.schedule(np.zeros(()), scene.linkage))
     equal(start(pd), start(expected))
+    arm = random_linkage("RRR", np.random.default_rng(0))
+    point = fj.references.SetPoint([0.1, 0.2, 0.3])
+    pd = fj.PDController([5.0, 0, 0], [0, 2.0, 0], [3, 2, 1], point)
+    again = fj.from_mjcf(fj.to_mjcf(arm, (pd, fj.JointEffort([0, 0, 4.0]))))
+    servo, motor = again.forces
+    equal((servo.kp, servo.kd, servo.limit), (pd.kp, pd.kd, [3, 2, np.inf]))
+    equal(motor.tau, [0, 0, 4])
+    with pytest.raises(ValueError, match="forces.0.: expected no limit of efforts"):
+        fj.to_mjcf(arm, (pd, fj.JointEffort(1.0)))
 
 
 def test_arms_with_fixed_pairs_come_back_as_they_were():
@@ -116,16 +122,3 @@ def test_arms_with_fixed_pairs_come_back_as_they_were():
         equal(fj.tip_position(again, q[moves]), fj.tip_position(arm, q), 1e-12)
         qdd = fj.forward_dynamics(again, q[moves], qd[moves], tau[moves])
         equal(qdd, fj.forward_dynamics(arm, q, qd, tau)[moves], 1e-9)
-
-
-def test_limits_of_one_joint_leave_others_free():
-    """A limited joint beside a motor; gains of 0; both come back."""
-    arm = random_linkage("RRR", np.random.default_rng(0))
-    point = fj.references.SetPoint([0.1, 0.2, 0.3])
-    pd = fj.PDController([5.0, 0, 0], [0, 2.0, 0], [3, 2, 1], point)
-    again = fj.from_mjcf(fj.to_mjcf(arm, (pd, fj.JointEffort([0, 0, 4.0]))))
-    servo, motor = again.forces
-    equal((servo.kp, servo.kd, servo.limit), (pd.kp, pd.kd, [3, 2, np.inf]))
-    equal(motor.tau, [0, 0, 4])
-    with pytest.raises(ValueError, match="forces.0.: expected no limit of efforts"):
-        fj.to_mjcf(arm, (pd, fj.JointEffort(1.0)))

@@ -59,21 +59,20 @@ def test_linkage_is_drawn_where_kinematics_puts_it(topology):
         close(link[0], starts[k - 1])
         close(np.linalg.norm(link[1] - link[0]), linkage.length[k])
         # The fixed offset belongs to the link, the slide to the rail.
-        rail = drawn.get(f"rail {k + 1}", drawn[f"link {k}"]).get_xydata()
-        close(rail[-1], ends[k])
+        rail = drawn.get(f"rail {k + 1}", drawn[f"link {k}"])
+        close(rail.get_xydata()[-1], ends[k])
         if kind == "P":  # the carriage stands across
             turn = drawn[f"slider {k}"]._marker.get_user_transform().get_matrix()
             along = np.diff(drawn[f"rail {k}"].get_xydata(), axis=0)[0]
             close(turn[0, 0] * along[1], turn[1, 0] * along[0])
-        center = fj.mass_centers(linkage, Q)[k - 1]
-        close(drawn[f"mass {k}"].get_xydata()[-1], center)
+        close(drawn[f"mass {k}"].get_xydata()[-1], fj.mass_centers(linkage, Q)[k - 1])
     same(drawn["tip 3"], ends[-1:])
     # What lies on something else hides nothing: mass centres under the tip and pins.
     order = [line.get_gid().split()[0] for line in ax.lines if line.get_gid()]
     assert order.index("mass") < order.index("tip") < len(order) - 3
 
 
-def test_linkage_options():
+def test_options_of_a_linkage_and_what_has_no_place():
     ax = plt.subplots()[1]
     ax.scatter([5], [9])
     style = dict(color="red", alpha=0.5, mass_centers=False)
@@ -81,6 +80,10 @@ def test_linkage_options():
     assert ax.get_xlim()[1] > 5 and ax.get_ylim()[1] > 9  # what was there stays in view
     assert ax.get_aspect() == 1 and ax.get_xlabel() == "x [m]" and "mass 1" not in drawn
     assert (drawn["link 1"].get_color(), drawn["link 1"].get_alpha()) == ("red", 0.5)
+    hidden = fj.JointDamper(1.0), lambda *_: 0, fj.forces.Brake(1)
+    assert drawn_with(*hidden).keys() == drawn_with().keys()
+    with pytest.raises(ValueError, match="link: expected 0"):
+        drawn_with(fj.Wrench(fj.Point(5), [1, 0]))
 
 
 def test_chrono_cyclograph_takes_the_nearest_samples():
@@ -88,8 +91,7 @@ def test_chrono_cyclograph_takes_the_nearest_samples():
     ax = drawing.chrono_cyclograph(linkage, solution, every=0.1, until=0.3)
     last_links, samples = named(ax, "link 3"), [0, 10, 20, 30]
     for line, sample in zip(last_links, samples, strict=True):
-        tip = fj.tip_position(linkage, solution.q[sample])
-        close(line.get_xydata()[-1], tip)
+        close(line.get_xydata()[-1], fj.tip_position(linkage, solution.q[sample]))
     brightness = [sum(to_rgb(line.get_color())) for line in last_links]
     assert brightness == sorted(brightness, reverse=True)
     assert len(named(ax, "tip 3")) == 1  # only the last configuration is whole
@@ -100,7 +102,7 @@ def test_chrono_cyclograph_takes_the_nearest_samples():
     failed = eqx.tree_at(lambda s: s.q, solution, solution.q.at[51:].set(jnp.nan))
     for motion, until, count in (
         (solution, 5.0, 11),
-        (solution, 0.0, 1),
+        (solution, 0, 1),
         (failed, None, 6),
     ):
         ax = drawing.chrono_cyclograph(LINKAGE, motion, until=until)
@@ -130,8 +132,8 @@ def test_times_and_labels_have_a_place_of_their_own():
 # Elements
 
 
-def drawn_with(*forces):
-    return lines(drawing.draw_linkage(ARM, AT, forces=forces))
+def drawn_with(*forces, arm=ARM, at=AT):
+    return lines(drawing.draw_linkage(arm, at, forces=forces))
 
 
 def strokes(line):
@@ -146,28 +148,25 @@ def place(point):
 
 
 def test_what_is_between_points_joins_them():
-    cable = dict(stiffness=3.0, one_sided="cable")
-    ends = np.stack([place(HOOK), place(TIP)])
-    for kind, values, hangs in (
-        ("spring", dict(stiffness=3.0), False),
-        ("damper", dict(damping=3.0), False),
-        ("cable", dict(rest_length=0.5, **cable), False),
-        ("cable", dict(rest_length=4.0, **cable), True),
-    ):
-        xy = drawn_with(fj.SpringDamper(HOOK, TIP, **values))[f"{kind} 0"].get_xydata()
+    """Brackets and ground hold points beside links."""
+    joins = lambda **values: fj.SpringDamper(HOOK, TIP, **values)
+    cable, ends = dict(stiffness=3.0, one_sided="cable"), [place(HOOK), place(TIP)]
+    for kind, part, hangs in (
+        ("spring", joins(stiffness=3.0), False), ("damper", joins(damping=3.0), False),
+        ("cable", joins(rest_length=0.5, **cable), False),
+        ("cable", joins(rest_length=4.0, **cable), True),
+    ):  # fmt: skip
+        xy = drawn_with(part)[f"{kind} 0"].get_xydata()
         close(xy[0], ends[0])
         assert np.isclose(xy, ends[1]).all(axis=1).any()
-        assert (np.nanmin(xy[:, 1]) < ends[:, 1].min() - 0.1) == hangs
-    bumper = dict(stiffness=3.0, rest_length=0.5, one_sided="bumper")
-    _, plate, *_ = strokes(drawn_with(fj.SpringDamper(HOOK, TIP, **bumper))["bumper 0"])
+        assert (np.nanmin(xy[:, 1]) < np.min(ends, axis=0)[1] - 0.1) == hangs
+    bumper = joins(stiffness=3.0, rest_length=0.5, one_sided="bumper")
+    _, plate, *_ = strokes(drawn_with(bumper)["bumper 0"])
     close(np.linalg.norm(plate.mean(axis=0) - place(HOOK)), 0.5)  # its rest length
-
-
-def test_brackets_and_ground_hold_points_beside_links():
     links = fj.scenes.fig5().linkage  # of 1 m along x
     off, on, nail = fj.Point(1, 0.5, 0.3), fj.Point(2, 0.5), fj.Point(0, 0.5, -1.0)
     ropes = tuple(fj.forces.Tension(point, on, 1.0) for point in (off, nail))
-    drawn = lines(drawing.draw_linkage(links, np.zeros(3), forces=ropes))
+    drawn = drawn_with(*ropes, arm=links, at=np.zeros(3))
     close(strokes(drawn["tension 0"]), [[[0.5, 0.3], [1.5, 0]], [[0.5, 0], [0.5, 0.3]]])
     close(strokes(drawn["tension 1"])[1].mean(axis=0), [0.5, -1])
 
@@ -233,13 +232,6 @@ def test_elements_move_with_the_arm_and_a_payload_comes():
     animation._draw_was_started = True  # type: ignore[attr-defined]
 
 
-def test_what_has_no_place_is_not_drawn():
-    hidden = fj.JointDamper(1.0), lambda *_: 0, fj.forces.Brake(1)
-    assert drawn_with(*hidden).keys() == drawn_with().keys()
-    with pytest.raises(ValueError, match="link: expected 0"):
-        drawn_with(fj.Wrench(fj.Point(5), [1, 0]))
-
-
 # Motions
 
 
@@ -265,11 +257,8 @@ def test_a_gif_holds_each_frame_until_the_end(tmp_path, capsys):
 
 def test_a_grid_moves_together_with_the_forces_of_its_titles():
     spring = fj.SpringDamper(fj.Point(0, 1, 1), fj.Point(3, 0.6), stiffness=1)
-    short = make_linkage("PRR"), swinging(51, 0.5)
-    pairs, forces = (
-        {"long": (LINKAGE, swinging()), "short": short},
-        {"short": (spring,)},
-    )
+    short, forces = (make_linkage("PRR"), swinging(51, 0.5)), {"short": (spring,)}
+    pairs = {"long": (LINKAGE, swinging()), "short": short}
     for speed, frames in ((1.0, 26), (2.0, 14)):
         animation = drawing.animate_grid(pairs, speed=speed)
         assert len(list(animation.new_frame_seq())) == frames

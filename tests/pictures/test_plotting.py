@@ -46,10 +46,8 @@ def test_motion_profile_shows_joints_and_references():
     forces = (fj.control.FirstOrderLag(fj.PDController(9, 1, 1, step), 0.1),)
     fig = plotting.motion_profile(RPR, solution, forces=forces, title="An arm")
     angles, slides = fig.axes
-    assert (angles.get_ylabel(), slides.get_ylabel()) == (
-        "angle [degrees]",
-        "slide [m]",
-    )
+    ylabels = angles.get_ylabel(), slides.get_ylabel()
+    assert ylabels == ("angle [degrees]", "slide [m]")
     assert slides.get_xlabel() == "time [s]" and fig.get_suptitle() == "An arm"
     assert labels(angles) == ["R1", "R3", "reference"]
     assert labels(slides) == ["P2", "reference"]
@@ -149,15 +147,12 @@ def test_effort_profile_shows_a_short_start_larger():
 # Tracking
 
 
-def test_a_legend_takes_as_many_rows_as_it_needs():
-    solutions = {"paper gains": swinging(), "tuned gains": swinging()}
-    for words in (solutions, {2 * name: s for name, s in solutions.items()}):
-        ax = plotting.tracking(LINKAGE, TASK, words)
+def test_tracking_and_its_error():
+    for times in (1, 2):  # the legend takes as many rows as it needs
+        long = {times * name: swinging() for name in ("paper gains", "tuned gains")}
+        ax = plotting.tracking(LINKAGE, TASK, long)
         assert ax.get_legend().get_window_extent().x1 <= ax.figure.bbox.x1
         assert len(labels(ax)) == 3
-
-
-def test_tracking_and_its_error():
     solutions = {"paper": swinging(), "tuned": swinging(51, 0.5)}
     ax = plotting.tracking(LINKAGE, TASK, solutions)
     assert labels(ax) == ["commanded", "paper", "tuned"]

@@ -43,8 +43,7 @@ def test_a_step_of_a_slide_is_that_of_a_second_order_system(begin):
     measures = found.overshoot, found.rise_time, found.settling_time
     np.testing.assert_allclose(measures, [[overshoot], [rise], [settled]], rtol=2e-3)
     np.testing.assert_allclose([found.step, found.largest_error], 0.5, rtol=1e-4)
-    samples = np.append(begin, TS[begin < TS]) - begin
-    errors = 0.5 * np.interp(samples, ts, 1 - share)
+    errors = 0.5 * np.interp(np.append(begin, TS[begin < TS]) - begin, ts, 1 - share)
     np.testing.assert_allclose(found.rms_error, np.sqrt(np.mean(errors**2)), rtol=1e-5)
     assert found.saturated == 0 and found.joints == ("P1",)
 
@@ -95,8 +94,7 @@ def test_a_reference_that_moves_has_errors_alone():
     found = response(SLIDE, forces, motion)
     np.testing.assert_allclose(found.largest_error, np.exp(-1) / W, rtol=1e-3)
     assert np.isnan([found.overshoot, found.rise_time, found.settling_time]).all()
-    after = response(SLIDE, forces, motion, since=1.5)
-    assert after.largest_error < 0.1 / W
+    assert response(SLIDE, forces, motion, since=1.5).largest_error < 0.1 / W
     assert "P1: no step, as its reference moves meanwhile" in str(found)
 
 
@@ -131,10 +129,9 @@ def test_sampled_control_is_measured_as_it_acted():
 
 
 def test_a_report_tells_steps_and_what_a_load_leaves():
-    steps, away = (
-        response(SLIDE, (pd_of(Step(0.0, [0.5])),), stepped(0.0, to), since=0.0)
-        for to in (0.5, 0.55)
-    )
+    forces = (pd_of(Step(0.0, [0.5])),)
+    ends = stepped(0.0, 0.5), stepped(0.0, 0.55)
+    steps, away = (response(SLIDE, forces, motion, since=0.0) for motion in ends)
     assert str(steps).count("\n") == 2 and "steady error" in str(steps)
     np.testing.assert_allclose(away.steady_error, 0.05, atol=2e-4)
     assert "P1 ends 10 % of its step away from the reference" in str(away)

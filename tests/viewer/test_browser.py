@@ -52,17 +52,14 @@ def time_of(page):
 
 
 def texts(page, places):
-    found = (
-        "Array.from(document.querySelectorAll(arguments[0]), one => one.textContent)"
-    )
-    return page.run(f"return {found}", places)
+    every = "document.querySelectorAll(arguments[0])"
+    return page.run(f"return Array.from({every}, one => one.textContent)", places)
 
 
 def scrub(page, time):
-    slider = (
-        "const slider = document.getElementById('time'); slider.value = arguments[0];"
-    )
-    page.run(f"{slider} slider.dispatchEvent(new Event('input'))", float(time))
+    slider = "const slider = document.getElementById('time');"
+    moved = "slider.value = arguments[0]; slider.dispatchEvent(new Event('input'))"
+    page.run(slider + moved, float(time))
     page.drawn()
 
 
@@ -122,9 +119,8 @@ def test_the_scrubber_moves_the_tip_to_its_place(one):
 def test_it_plays_and_stops_at_the_end(one):
     one.press("l", *["ArrowDown"] * 3, " ")  # slowly, and not again from the start
     seen = [time_of(one) for _ in range(3) if one.drawn() is None]
-    assert (
-        0 < seen[0] < seen[1] < seen[2] < 2 and of(one, "play", "ariaLabel") == "pause"
-    )
+    assert 0 < seen[0] < seen[1] < seen[2] < 2
+    assert of(one, "play", "ariaLabel") == "pause"
     scrub(one, 1.99)
     one.run(
         "const play = document.getElementById('play');"

@@ -61,11 +61,9 @@ def test_rows_are_those_of_the_motion_in_32_bits(show):
     for k, name in enumerate(("R1", "P2", "R3")):
         q = array(data, shown["q"][k])
         np.testing.assert_array_equal(q, np.float32(MOTION.q[:, k]))
-        for panel, values in (
-            ("position", MOTION.q), ("velocity", MOTION.qd), ("effort", forces)
-        ):  # fmt: skip
-            found = series[panel, name]
-            np.testing.assert_allclose(found, values[:, k], rtol=1e-6)
+        rows = dict(position=MOTION.q, velocity=MOTION.qd, effort=forces)
+        for panel, row in rows.items():
+            np.testing.assert_allclose(series[panel, name], row[:, k], rtol=1e-6)
     for row in (0, 50):
         energies = fj.energy(ARM, MOTION.q[row], MOTION.qd[row])
         for name, energy in zip(("kinetic", "potential"), energies):
@@ -105,11 +103,11 @@ def test_a_batch_and_titles_make_many_motions(show):
     scaled = [LINKAGE.replace(length=k * LINKAGE.length) for k in (1, 2, 3)]
     arms = jax.tree.map(lambda *leaves: jnp.stack(leaves), *scaled)
     _, data = show(arms, failed)
-    titles = [motion["title"] for motion in data["motions"]]
-    assert titles == ["member 0", "member 1", "member 2"]
-    rows = [array(data, motion["t"]).size for motion in data["motions"]]
-    assert rows == [5, 3, 5]
-    assert [motion["length"][1] for motion in data["motions"]] == [1, 2, 3]
+    about = [
+        (motion["title"], array(data, motion["t"]).size, motion["length"][1])
+        for motion in data["motions"]
+    ]
+    assert about == [("member 0", 5, 1), ("member 1", 3, 2), ("member 2", 5, 3)]
     arms, spring = {"a": LINKAGE, "b": ARM}, fj.SpringDamper(HOOK, TIP, stiffness=1)
     _, data = show(arms, {"a": SOLUTION, "b": swinging(7)}, {"a": (), "b": (spring,)})
     first, second = data["motions"]
@@ -161,7 +159,7 @@ def test_events_modes_and_ends_are_marked(show):
     assert show(ARM, failed)[1]["motions"][0]["ending"] == "not finite at 0.5 s"
 
 
-def test_no_title_is_taken_for_the_page(show):
+def test_no_title_is_taken_for_the_page_that_a_notebook_shows(show):
     title = "</script><!--data--><b>\"'&"
     view, data = show(LINKAGE, {title: SOLUTION})
     assert data["motions"][0]["title"] == title
@@ -169,9 +167,6 @@ def test_no_title_is_taken_for_the_page(show):
     titles = ("a <i>", "b", "c", "d", "e", "f")
     view, _ = show(LINKAGE, dict.fromkeys(titles, SOLUTION))
     assert "<title>a &lt;i&gt;, b, c, d, e, ...</title>" in view.html
-
-
-def test_a_notebook_shows_the_page(show):
     view, _ = show(LINKAGE, SOLUTION)
     assert "<title>RRR arm</title>" in view.html
     assert repr(view) == f"View(path={view.path!r})"
@@ -181,10 +176,8 @@ def test_a_notebook_shows_the_page(show):
 
 
 def test_scenes_stand_for_linkages_and_their_own_forces(show):
-    start, forces = (
-        fj.State([0.0] * 3, [0.0] * 3),
-        [(fj.JointDamper(k),) for k in (1, 2)],
-    )
+    start = fj.State([0.0] * 3, [0.0] * 3)
+    forces = [(fj.JointDamper(k),) for k in (1, 2)]
     before, after = (fj.Scene(ARM, start, own, 1.0) for own in forces)
     assert show(before, MOTION)[1] == show(ARM, MOTION, forces[0])[1]
     arms = {"before": before, "after": after, "free": ARM}
@@ -194,10 +187,7 @@ def test_scenes_stand_for_linkages_and_their_own_forces(show):
     assert not free.size  # a free motion has no curves of efforts
     with pytest.raises(ValueError, match=r"got Scene\(linkage=.{183}\.{3}\.$"):
         fj.view(before, {"a": MOTION})  # what a message leaves out is told
-
-
-def test_sampled_motions_come_with_their_control(show):
-    """Its efforts are those that acted."""
+    # Sampled motions come with their control; its efforts are those that acted.
     acting = np.arange(15.0).reshape(5, 3)
     motion = changed(SOLUTION, tau=acting, acting=acting)
     (shown,) = (data := show(LINKAGE, motion, (lambda *_: 0.0,))[1])["motions"]
