@@ -124,9 +124,11 @@ def test_times_and_labels_have_a_place_of_their_own():
         k = round(10 * float(text.get_text()[:-2]))
         close(text.xy, fj.tip_position(linkage, motion.q[k]))
     # The limits that equal scales need have longer ticks than those before.
-    drawing.animate(LINKAGE, made_up(ts, Q + ts[:, None] * [0.3, -0.8, 0.7]))
-    plt.gcf().draw_without_rendering()
+    moved = made_up(ts, Q + ts[:, None] * [0.3, -0.8, 0.7])
+    animation = drawing.animate(LINKAGE, moved)
+    plt.gcf().canvas.draw()
     assert plt.gcf().axes[0].yaxis.label.get_window_extent().x0 >= 0
+    del animation  # which warns unless it was drawn
 
 
 # Elements
