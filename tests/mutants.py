@@ -516,12 +516,6 @@ MUTANTS = {
         "pass",
         f"{SWITCHES}::test_switches_of_a_plain_function_are_located",
     ),
-    "places of zeros have derivatives of their own": Mutant(
-        "steps/events.py",
-        "passed = passage(*constant(at))",
-        "passed = passage(*at)",
-        f"{HOLDING}::test_a_dragged_slide_sticks_and_slips_as_scipy_has_it",
-    ),
     "a run ends where its last step does": Mutant(
         "steps/events.py",
         "end, there = at_zero(self.term, t, y, args, which, ended & comes)",

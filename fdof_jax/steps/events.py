@@ -280,7 +280,7 @@ class Events(eqx.Module):
         values, checks = _values(*constant((self.term, t0, t1, path, own)))
         brief = h <= jnp.maximum(SHORTEST[t1.dtype], _BRIEF * near)
         at = values, checks, sides, regime.on_zero, regime.sizes, near / h, brief
-        passed = passage(*constant(at))  # of what a plain function holds, too
+        passed = passage(*constant(at))
         # A function that began on its zero has left it, after one or more steps.
         left = jnp.finfo(passed.sizes.dtype).eps ** _ON_ZERO * passed.sizes
         on_zero = last.sizes <= left
