@@ -62,17 +62,16 @@ def check_motion(row, name):
         assert motion.events.table["event"].tolist() == row.events
 
 
-def check_derivatives(rows, **options):
+@eqx.filter_jit(**LOOPS)
+@eqx.filter_vmap
+def _changed(scene, change, ts):
+    """Returns what is known of motions, and how it changes with the scenes."""
+    motion = lambda scene: known(fj.simulate(scene, ts, adjoint=diffrax.ForwardMode()))
+    return eqx.filter_jvp(motion, (scene,), (change,))
+
+
+def check_derivatives(rows):
     """Checks derivatives in all numbers, by one program for a batch of all rows."""
-    options |= dict(adjoint=diffrax.ForwardMode())
-
-    @eqx.filter_jit(**LOOPS)
-    @eqx.filter_vmap
-    def changed(scene, change, ts):
-        """Returns what is known of motions, and how it changes with the scenes."""
-        motion = lambda scene: known(fj.simulate(scene, ts, **options))
-        return eqx.filter_jvp(motion, (scene,), (change,))
-
     names, members, right = [], [], []
     for name, row in rows.items():
         for axis in np.eye(len(row.numbers)):
@@ -83,13 +82,13 @@ def check_derivatives(rows, **options):
             members.append((scene, change, jnp.array(row.ts, float)))
             right.append(jax.jvp(lambda *x, row=row: row.exact(*x), *pair))
             names.append(name)
-    found = changed(*jax.tree.map(lambda *parts: jnp.stack(parts), *members))
+    found = _changed(*jax.tree.map(lambda *parts: jnp.stack(parts), *members))
     for k, (name, wanted) in enumerate(zip(names, right)):
         for of_all, exact in zip(found, wanted):
             # What never changes, as modes, has no derivative.
             keys = [key for key in exact if of_all[key] is not None]
-            member = {key: of_all[key][k] for key in keys}
-            exact = {key: exact[key] for key in keys}
+            member, exact = ({key: of[key] for key in keys} for of in (of_all, exact))
+            member = {key: value[k] for key, value in member.items()}
             check_known(member, exact, name, rtol=1e-9, atol=1e-9)
 
 

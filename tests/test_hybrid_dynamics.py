@@ -16,7 +16,6 @@ from scipy.integrate import simpson, solve_ivp
 
 import fdof_jax as fj
 from fdof_jax.simulation import PrescribedMotion
-from fdof_jax.steps.looped_dopri8 import LoopedDopri8
 
 pytestmark = pytest.mark.slow
 # A cart that slides along x and carries a pendulum: link 3 turns with link 4.
@@ -326,7 +325,7 @@ def test_a_load_on_a_table(name):
 
 
 def test_derivatives_of_all_these():
-    held.check_derivatives(DIFFERENTIABLE, solver=LoopedDopri8())
+    held.check_derivatives(DIFFERENTIABLE)
 
 
 def test_a_kicked_table_in_reverse_mode():
