@@ -23,6 +23,7 @@ LONGEST = {
     "test_guides",
     "test_notebooks",
     "test_holding",
+    "test_holding_of_several",
     "test_derivatives_at_rest",
     "test_signals",
     "test_gradients",

@@ -44,6 +44,11 @@ PD = fj.PDController([9.0, 7.0, 5.0], [3.0, 2.0, 1.0], [4.0, 2.0, 9.0], MOVE)
 SHORT = dict(
     solver=diffrax.Midpoint(), stepsize_controller=diffrax.ConstantStepSize(), dt0=0.01
 )
+FORWARD = dict(adjoint=diffrax.ForwardMode())
+
+# A bar and a slide of 1 kg, whose programs compile faster than those of three links
+BAR = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[1 / 12])
+SLIDE = fj.Linkage("P", length=[0, 1], com=[[0, 0]], mass=[1], inertia=[1], gravity=0.0)
 
 # Efforts in the joints, between points and from outside
 PLAIN = {

@@ -55,7 +55,7 @@ def check_known(found, exact, name, **bounds):
 
 def check_motion(row, name):
     motion = fj.simulate(row.scene(*row.numbers), row.ts)
-    check_known(known(motion), row.exact(*row.numbers), name, rtol=1e-7, atol=1e-9)
+    check_known(known(motion), row.exact(*row.numbers), name, rtol=1e-9, atol=1e-9)
     # To be held is to be held exactly.
     assert not (motion.qd * (motion.modes > 0)).any()
     if row.events is not None:

@@ -6,15 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from elements import BAR, SLIDE
 from scipy.integrate import solve_ivp
 
 import fdof_jax as fj
 from fdof_jax.steps.looped_dopri8 import LoopedDopri8
 
-SLIDE = fj.Linkage(
-    "P", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[0.1], gravity=0
-)
-ROTOR = fj.Linkage("R", length=[0, 1], com=[[0, 0]], mass=[1], inertia=[1], gravity=0)
+pytestmark = pytest.mark.slow
+ROTOR = BAR.replace(com=[[0, 0]], inertia=[1], gravity=0.0)
 PENDULUM = fj.scenes.double_pendulum().linkage
 BATCH = dict(solver=LoopedDopri8(), throw=False)
 
@@ -40,14 +39,10 @@ def integrated(aside, radius, speed, stiffness, end):
         push = stiffness * max(radius - distance, 0)
         return [y[1], push * along / distance]
 
-    found = solve_ivp(
-        rates, [0, end], [0, speed], "DOP853", max_step=radius / speed / 10,
-        rtol=1e-10, atol=1e-11,
-    )  # fmt: skip
-    return found.y[0, -1]
+    options = dict(max_step=radius / speed / 10, rtol=1e-10, atol=1e-11)
+    return solve_ivp(rates, [0, end], [0, speed], "DOP853", **options).y[0, -1]
 
 
-@pytest.mark.slow
 def test_no_bumper_is_passed_over():
     """Some are met or missed by little within one step, which would end at 4.7 m."""
     rng = np.random.default_rng(0)
@@ -81,7 +76,6 @@ def meeting(q, qd, place, radius, end, tolerance, max_step):
     return fj.simulate(PENDULUM, start, ts, (peg,), **options, **BATCH)
 
 
-@pytest.mark.slow
 def test_no_peg_is_passed_over():
     """Against steps much shorter than the pegs, which are where tips are at 0.4 s."""
     rng = np.random.default_rng(5)
@@ -120,8 +114,7 @@ def turning(waves, rate, torque, speed, end):
 
 def turned(waves, rate, torque, speed, end):
     """Returns the last angle and the number of switches, one half wave at a time."""
-    t = q = 0.0
-    count = 0
+    t, q, count = 0.0, 0.0, 0
     while True:
         torque_now = torque * (-1) ** count
         if waves:
@@ -136,7 +129,6 @@ def turned(waves, rate, torque, speed, end):
         t, speed, count = t + length, speed + torque_now * length, count + 1
 
 
-@pytest.mark.slow
 def test_random_fast_switching():
     rng = np.random.default_rng(0)
     angular = np.arange(72) % 2
@@ -151,7 +143,6 @@ def test_random_fast_switching():
     np.testing.assert_allclose(found.q[:, -1, 0], angles, atol=1e-8)
 
 
-@pytest.mark.slow
 def test_where_a_step_ends_is_measured_by_the_motion():
     """A step that is tried over a cushion's edge, at 0, may go on for 50 km."""
     cushion = lambda t, q, qd, linkage: fj.forces.switch(q, 0.0, 2 * 9.81)

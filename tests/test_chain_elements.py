@@ -21,14 +21,12 @@ pytestmark = pytest.mark.slow
 ARM, VALUES = elements.arm("RPR"), {n: np.asarray(v) for n, v in elements.ARM.items()}
 PLACE = 1  # of the fixed pair, behind the first link
 LONGER = fj.Linkage(
-    "RFPR",
-    length=np.insert(VALUES["length"], 2, 0),
+    "RFPR", length=np.insert(VALUES["length"], 2, 0), base_angle=ARM.base_angle,
     com=np.insert(VALUES["com"], PLACE, [0.3, 0.2], axis=0),
     mass=np.insert(VALUES["mass"], PLACE, 0),
     inertia=np.insert(VALUES["inertia"], PLACE, 0),
     locked=np.insert(np.asarray(ARM.locked), PLACE, 0),
-    base_angle=ARM.base_angle,
-)
+)  # fmt: skip
 
 
 class Padded(eqx.Module):
@@ -62,9 +60,8 @@ def padded(tree):
 
 def without_fixed(tree):
     """Returns values of the shorter arm; those that are not per joint stay."""
-    return jax.tree.map(
-        lambda row: np.delete(row, PLACE, axis=-1) if row.shape[-1] == 4 else row, tree
-    )
+    less = lambda row: np.delete(row, PLACE, axis=-1) if row.shape[-1] == 4 else row
+    return jax.tree.map(less, tree)
 
 
 Q, QD, QDD, TAU = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (4, 3)))
@@ -99,14 +96,11 @@ def balanced(arm, q, qd, pd):
 
 
 def dynamics(arm, q, qd, qdd, tau, forces):
-    regressor, parameters = (
-        fj.analysis.regressor(arm, q, qd, qdd),
-        fj.analysis.inertial_parameters(arm),
-    )
+    regressor = fj.analysis.regressor(arm, q, qd, qdd)
     return (
         fj.forward_dynamics(arm, q, qd, tau, forces),
         fj.inverse_dynamics(arm, q, qd, qdd, forces),
-        jnp.tensordot(regressor, parameters, 2),
+        jnp.tensordot(regressor, fj.analysis.inertial_parameters(arm), 2),
         fj.analysis.holding_efforts(arm, q),
     )
 

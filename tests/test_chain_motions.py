@@ -1,7 +1,7 @@
-"""Motions of chains of other numbers of joints than three, and their derivatives."""
+"""Derivatives of motions of chains with a fixed pair.
 
-import json
-from pathlib import Path
+Motions of other numbers of joints than three are in tests/hard/test_motions.py.
+"""
 
 import chains
 import equinox as eqx
@@ -14,39 +14,9 @@ from modes import ADJOINT, LOOPS
 
 import fdof_jax as fj
 
-REFERENCE = json.loads((Path(__file__).parent / "hard/reference.json").read_text())
-FIELDS = "length", "com", "mass", "inertia", "locked", "base_angle", "gravity"
+pytestmark = pytest.mark.slow
 
 
-# Ten times the errors that were found: at the end of the motion and, interpolated,
-# before. The double pendulum multiplies errors by 5000.
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "name, at_end, before",
-    [("double-pendulum", 2e-8, 2e-8), ("cart-pole", 3e-11, 5e-10)],
-)
-def test_motions_equal_the_reference(name, at_end, before):
-    values = REFERENCE[name]
-    arm = fj.Linkage(values["topology"], **{field: values[field] for field in FIELDS})
-    start = fj.State(values["q0"], values["qd0"])
-    forces = fj.JointEffort(values["effort"]), fj.JointDamper(values["damping"])
-    ts = np.linspace(0, values["t1"], len(values["q"]))
-    motion = fj.simulate(arm, start, ts, forces)
-    error = np.abs(motion.q - np.asarray(values["q"])).max(axis=1)
-    assert error[-1] <= at_end and error.max() <= before
-
-
-@pytest.mark.slow
-def test_the_two_link_arm_on_its_circle_equals_the_reference():
-    arm, start, forces, t1 = fj.scenes.two_link_circle()
-    wanted = REFERENCE["two-link-circle"]
-    np.testing.assert_allclose(start.q, wanted["q0"], atol=1e-15)
-    motion = fj.simulate(arm, start, np.linspace(0, t1, len(wanted["q"])), forces)
-    np.testing.assert_allclose(motion.q, wanted["q"], atol=2e-10)
-    np.testing.assert_allclose(motion.q[-1], wanted["q"][-1], atol=1e-12)
-
-
-@pytest.mark.slow
 def test_gradients_of_a_motion_equal_differences():
     """In reverse mode, with elements in arrays, with inertia and with a state.
 

@@ -25,12 +25,9 @@ def rods(n, tip_mass=1.0):
     """Returns n revolute links, all of other lengths and masses."""
     length = 1 + np.arange(n) / 8
     return fj.Linkage(
-        "R" * n,
-        length=[0, *length],
-        com=np.stack([length / 2, np.zeros(n)], axis=1),
-        mass=[*(1 + np.arange(n - 1) / 4), tip_mass],
-        inertia=length**2 / 16,
-    )
+        "R" * n, length=[0, *length], com=np.outer(length / 2, [1, 0]),
+        mass=[*(1 + np.arange(n - 1) / 4), tip_mass], inertia=length**2 / 16,
+    )  # fmt: skip
 
 
 def exact(arm, q, qd):

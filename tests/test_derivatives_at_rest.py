@@ -13,16 +13,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from elements import BAR, SLIDE
 from helpers import Hold
 from modes import ADJOINT, LOOPS
 from scipy.linalg import expm
 
 import fdof_jax as fj
 
-HANGING = fj.Linkage(
-    "R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[1 / 12],
-    base_angle=-np.pi / 2,
-)  # fmt: skip
+HANGING = BAR.replace(base_angle=-np.pi / 2)
 
 
 class Pushes(eqx.Module):
@@ -52,10 +50,8 @@ def changed(numbers, scene):
 def end(numbers, scene, adjoint, rtol=None):
     """Returns a weighted sum of the last positions and velocities, and steps."""
     arm, forces, start = changed(numbers, scene)
-    motion = fj.simulate(
-        arm, start, jnp.stack([0.0, scene[2]]), forces,
-        adjoint=adjoint, throw=False, rtol=rtol, atol=rtol,
-    )  # fmt: skip
+    options = dict(adjoint=adjoint, throw=False, rtol=rtol, atol=rtol)
+    motion = fj.simulate(arm, start, jnp.stack([0.0, scene[2]]), forces, **options)
     last = jnp.concatenate([motion.q[-1], motion.qd[-1]])
     # Of a failed motion nothing may count.
     good = motion.result == diffrax.RESULTS.successful
@@ -92,9 +88,7 @@ def exact(numbers, scene):
     rates, in_state, in_numbers = map(np.asarray, linearised(numbers, scene))
     assert np.abs(rates).max() < 1e-11  # at rest
     size, count = in_numbers.shape
-    matrix = np.block(
-        [[in_state, in_numbers], [np.zeros((count, size)), np.zeros((count, count))]]
-    )
+    matrix = np.pad(np.hstack([in_state, in_numbers]), ((0, count), (0, 0)))
     whole = expm(float(scene[2]) * matrix)[:size]
     modes = np.linalg.eigvals(in_state)
     columns = np.hstack([whole[:, size:], whole[:, :size]])
@@ -197,9 +191,6 @@ def test_random_arms_at_rest():
 
 
 # A slide with a controller: its motion is a matrix exponential.
-SLIDE = fj.Linkage(
-    "P", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[0.1], gravity=0
-)
 GOAL = 0.5
 
 

@@ -1,15 +1,15 @@
-"""Joints that are held for a while: closed forms, laws, roundings and derivatives.
+"""One joint that is held for a while: closed forms and derivatives.
 
-Scenes are data: those of one joint, and those of five, share a program each.
+Scenes are data, which share a program.
 """
 
-import diffrax
 import held_scenes as held
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from held_scenes import LATER, NEVER, Held, Row
+from elements import BAR, FORWARD, SLIDE
+from held_scenes import LATER, NEVER, Row
 from modes import hessian, jacobian
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
@@ -18,11 +18,9 @@ import fdof_jax as fj
 from fdof_jax.forces import Brake, HardStops, JointFriction, Payload, stribeck
 
 inf, G = np.inf, 9.81
-FORWARD = dict(adjoint=diffrax.ForwardMode())
-SLIDE = fj.Linkage("P", length=[0, 1], com=[[0, 0]], mass=[1], inertia=[1], gravity=0.0)
-DROP = SLIDE.replace(gravity=G)
-BAR = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[1 / 12])
-WHEEL = BAR.replace(gravity=0.0)
+DROP, WHEEL = SLIDE.replace(gravity=G), BAR.replace(gravity=0.0)
+BLOCK = DROP.replace(base_angle=0.3 - np.pi / 2)  # on a slope of 0.3 rad
+WEIGHT = G * np.sin(0.3)
 LOAD = G / 2  # of the bar, level
 REST = fj.State([0.0], [0.0])
 
@@ -34,9 +32,10 @@ def one_joint(
 ):  # fmt: skip
     """Returns a scene with all elements, most of which do nothing."""
     *places, step = target
-    target = fj.references.Step(*places, begin=step)
+    target, both = fj.references.Step(*places, begin=step), jnp.ones((2, 1))
+    static = level if static is None else static
     forces = (
-        JointFriction(level, static=level if static is None else static),
+        JointFriction(level * both, static=static * both),
         HardStops(*stops, restitution=restitution),
         Brake(1, *brake),
         Payload(fj.Point(1, 1.0), load, begin=carried[0], end=carried[1]),
@@ -79,6 +78,14 @@ def rests(height, e):
     return dict(last=end, q=[0.0], modes=[2.0], taken=[G * height])
 
 
+def turned(v, up, down):
+    """A block goes up against one friction, and comes down against another."""
+    top, height = v / (WEIGHT + up), v**2 / 2 / (WEIGHT + up)
+    q = height - (WEIGHT - down) * (1 - top) ** 2 / 2
+    return dict(q=[q], taken=[up * height + down * (height - q)])
+
+
+SLOPE = lambda v, up, down: one_joint(BLOCK, 0.0, v, level=jnp.array([[up], [down]]))
 RUBS = lambda rate, load: one_joint(SLIDE, 0.0, rate, level=1, static=2, effort=load)
 THROWN = lambda q, floor, qd: one_joint(DROP, q, qd, stops=(floor, inf))
 DIFFERENTIABLE = {
@@ -100,6 +107,12 @@ DIFFERENTIABLE = {
     "a ball bounces to rest": Row(ball, (1.0, 0.5), [0, 2.0], rests),
     "21 elastic bounces": bounced(10.0, 1.0, 21),
     "105 bounces": bounced(10.0, 0.99, 105),
+    # A declared jump carries the sides of a limit over their zeros.
+    "a step from one limit of a motor to the other": Row(
+        lambda t: one_joint(SLIDE, gains=(100, 0), limit=10, target=(1, -1, t)), (0.2,),
+        [0, 0.5],
+        lambda t: dict(q=[5 * t**2 + 10 * t * (0.5 - t) - 5 * (0.5 - t) ** 2]),
+    ),
     "a brake for a while": Row(
         lambda qd, *brake: one_joint(SLIDE, 0.0, qd, brake=brake, effort=2.0),
         (0.5, 0.4, 2.0), [0, 3.0],
@@ -116,9 +129,23 @@ DIFFERENTIABLE = {
             taken=[2 / 3 - 2 / 3 / (1 + 3 * m)],
         ),
     ),
+    "a block goes up against 4 N, turns, and comes down against 1 N": Row(
+        SLOPE, (2.0, 4.0, 1.0), [0, 1.0], turned
+    ),
+    "a block that still goes up": Row(
+        SLOPE, (2.0, 4.0, 1.0), [0, 0.1], lambda v, up, _: dict(
+            q=[v * 0.1 - (WEIGHT + up) * 0.005],
+            taken=[up * (v * 0.1 - (WEIGHT + up) * 0.005)],
+        ),
+    ),
 }  # fmt: skip
 
 
+# A block without a speed, on a slope or level, under a push uphill
+PUSHED = lambda linkage, up, down, push, q: Row(
+    lambda: one_joint(linkage, level=jnp.array([[up], [down]]), effort=push), (),
+    [0, 1.0], lambda: dict(q=[q]),
+)  # fmt: skip
 BLOW = dict(stops=(-inf, 1.0), target=(-1.0, -1.0, NEVER), effort=0.1)
 ROWS = DIFFERENTIABLE | {
     "static friction holds what has come to rest": Row(
@@ -159,6 +186,12 @@ ROWS = DIFFERENTIABLE | {
         lambda: dict(q=[-0.5] * 3, modes=[2.0, 4.0, 2.0]),
         ["rests on its stop", "is braked", "rests on its stop"],
     ),
+    "a block that is held on the way down": PUSHED(BLOCK, 1.0, WEIGHT + 0.1, 0.0, 0.0),
+    "a block that a push as large takes along": PUSHED(
+        BLOCK, 1.0, WEIGHT + 0.1, 2 * WEIGHT, (WEIGHT - 1) / 2
+    ),
+    "a push against no friction": PUSHED(SLIDE, 0.0, 3.0, 1.0, 0.5),
+    "a push against friction": PUSHED(SLIDE, 3.0, 0.0, 1.0, 0.0),
 }  # fmt: skip
 
 
@@ -246,41 +279,13 @@ def test_second_derivatives_of_slides_that_bounce_off_a_stop_and_come_to_rest():
     np.testing.assert_allclose(curves, jax.hessian(exact)(at), rtol=0, atol=1e-8)
 
 
-# Friction of two directions, and of functions
+def test_efforts_of_friction_that_has_a_level_in_each_direction():
+    scene = SLOPE(2.0, 4.0, 1.0)
+    efforts = fj.joint_efforts(scene, fj.simulate(scene, [0, 0.1, 1.0]))
+    np.testing.assert_allclose(efforts.total[:, 0], [-4, -4, 1], rtol=0, atol=1e-12)
 
 
-BLOCK = SLIDE.replace(gravity=G, base_angle=0.3 - np.pi / 2)  # on a slope of 0.3 rad
-WEIGHT = G * np.sin(0.3)
-
-
-@pytest.mark.slow
-def test_friction_has_a_level_in_each_direction():
-    """A block goes up against 4 N, turns, and comes down against 1 N."""
-
-    def slid(linkage, qd, up, down, effort=0.0):
-        forces = JointFriction([[up], [down]]), fj.JointEffort(effort)
-        motion = fj.simulate(linkage, fj.State([0.0], [qd]), [0, 0.1, 1.0], forces)
-        return forces, motion
-
-    v, up, down = 2.0, 4.0, 1.0
-    forces, motion = slid(BLOCK, v, up, down)
-    top, height = v / (WEIGHT + up), v**2 / 2 / (WEIGHT + up)
-    q = [0, v * 0.1 - (WEIGHT + up) * 0.1**2 / 2]
-    q += [height - (WEIGHT - down) * (1 - top) ** 2 / 2]
-    np.testing.assert_allclose(motion.q[:, 0], q, rtol=0, atol=1e-9)
-    taken = [0, up * q[1], up * height + down * (height - q[2])]
-    np.testing.assert_allclose(motion.taken, taken, rtol=0, atol=1e-9)
-    effort = fj.joint_efforts(BLOCK, forces, motion).total[:, 0]
-    np.testing.assert_allclose(effort, [-up, -up, down], rtol=0, atol=1e-12)
-    # Held on the way down, and taken along by a push uphill of the same size; without
-    # friction uphill, a push is held by none.
-    for case, end in (
-        ((BLOCK, 0.0, 1.0, WEIGHT + 0.1), 0.0),
-        ((BLOCK, 0.0, 1.0, WEIGHT + 0.1, 2 * WEIGHT), (WEIGHT - 1) / 2),
-        ((SLIDE, 0.0, 0.0, 3.0, 1.0), 0.5),
-        ((SLIDE, 0.0, 3.0, 0.0, 1.0), 0.0),
-    ):
-        np.testing.assert_allclose(slid(*case)[1].q[-1, 0], end, rtol=0, atol=1e-9)
+# Friction of functions
 
 
 def scipy_times(coulomb, static, speed, stiffness, pace, end):
@@ -311,7 +316,7 @@ def test_a_dragged_slide_sticks_and_slips_as_scipy_has_it():
         *friction, stiffness, pace = numbers
         drag = lambda t, q, qd, linkage: stiffness * (pace * t - q)
         forces, ts = (JointFriction(stribeck(*friction)), drag), [0, 0.9, 7.5]
-        options = dict(rtol=1e-12, atol=1e-12, **FORWARD)
+        options = dict(rtol=1e-12, atol=1e-12) | FORWARD
         motion = fj.simulate(SLIDE, REST, ts, forces, **options)
         return motion.events.t, motion.q[1:, 0], motion.taken[-1]
 
@@ -371,137 +376,3 @@ def test_states_of_drives_go_on_while_a_brake_holds():
     own = [leaf[-1, 0] for leaf in jax.tree.leaves(motion.own)]
     np.testing.assert_allclose([motion.q[-1, 0], motion.qd[-1, 0]], end[:2], atol=1e-9)
     np.testing.assert_allclose(np.sort(own), np.sort(end[2:]), atol=1e-8)
-
-
-# Several joints: all of these arms have five, by the program of random scenes
-
-
-def whole(row, rest=0.0):
-    return np.append(np.asarray(row, float), np.full(5 - len(row), rest))
-
-
-def several(
-    topology, q, qd, *, load=0.0, level=0.0, static=None, stops=(-inf, inf),
-    restitution=0.0, brake=(1, NEVER, LATER), carried=0.0, taken=NEVER, **links,
-):  # fmt: skip
-    """Returns a scene; fixed pairs without mass complete the arm."""
-    n = len(topology)
-    static = level if static is None else static
-    of_links = dict(length=[0] + [1] * n, com=[[0.5, 0]] * n, mass=[1] * n)
-    links = of_links | dict(inertia=[1 / 12] * n, locked=[0] * n, gravity=0.0) | links
-    com = np.concatenate([links["com"], np.zeros((5 - n, 2))])
-    links |= {k: whole(links[k]) for k in ("mass", "inertia", "locked")}
-    links |= dict(com=com, length=np.append(links["length"], np.zeros(5 - n)))
-    each = lambda x, rest=0.0: whole(np.broadcast_to(np.asarray(x, float), n), rest)
-    forces = (
-        # Of a load, so soft and so far from its rest that its effort is constant.
-        fj.forces.JointSpring(whole([1e-6 * bool(load)]), rest=1e6 * load),
-        JointFriction(each(level), static=each(static)),
-        HardStops(
-            each(stops[0], -inf), each(stops[1], inf), restitution=each(restitution)
-        ),
-        Brake(*brake),
-        Payload(fj.Point(n), carried, 0.0, begin=taken, velocity=[0.0, 0.0]),
-    )
-    arm = fj.Linkage(topology + "F" * (5 - n), **links)
-    return Held(arm, fj.State(jnp.asarray(whole(q)), jnp.asarray(whole(qd))), forces)
-
-
-def run(scene, ts):
-    return fj.simulate(scene.linkage, scene.state0, ts, scene.forces)
-
-
-@pytest.mark.slow
-def test_a_brake_holds_to_the_last_bit():
-    """The compensated sum carries rounding errors of the steps before."""
-    for begin in np.linspace(0.25, 0.75, 11):
-        scene = several("RR", [0.3, 0.8], [1.0, 2.0], brake=(2, begin, LATER))
-        motion = run(scene, np.linspace(0, 1, 41))
-        # In NumPy, as in JAX each number of rows is another program.
-        ts, q, qd = map(np.asarray, (motion.ts, motion.q, motion.qd))
-        np.testing.assert_array_equal(qd[ts > begin, 1], 0)
-        assert np.ptp(q[ts > begin, 1]) == 0
-
-
-@pytest.mark.slow
-def test_a_fixed_pair_has_no_stops():
-    """Its position is 0, which need not lie within a range that others have."""
-    options = dict(stops=([0.5, 0.5], [1.0, 1.0]), restitution=0.5, gravity=G)
-    motion = run(several("RF", [0.7, 0.0], [0.0, 0.0], **options), [0, 1.0])
-    assert 0.5 <= motion.q[-1, 0] <= 0.7
-
-
-@pytest.mark.slow
-def test_a_rounding_error_frees_no_joint():
-    """Inertia couples two slides by 6e-17, as pi / 2 is rounded; one rests on load."""
-
-    def crossed(angle=np.pi / 2, rate=0.0, stop=inf, load=1.5, **options):
-        return several(
-            "PP", [0.0, 0.0], [rate, 1.0], load=load, level=[1.0, 0.0],
-            static=[2.0, 0.0], stops=(-inf, [inf, stop]), restitution=0.5,
-            length=[0, 0, 0], com=[[0, 0]] * 2, inertia=[1, 1], locked=[angle, 0],
-            taken=1.0, **options,
-        )  # fmt: skip
-
-    scene = crossed()
-    assert 0 < fj.mass_matrix(scene.linkage, np.zeros(5))[0, 1] < 1e-15
-    brake = dict(brake=(2, 0.7, LATER))
-    for case in (
-        brake, dict(carried=1e-9), dict(carried=0.5), dict(stop=0.5), dict(rate=1e-17),
-        dict(rate=-1e-14),
-    ):  # fmt: skip
-        motion = run(crossed(**case), [0, 2.0])
-        assert motion.q[-1, 0] == 0 and motion.qd[-1, 0] == 0, case
-        assert (motion.modes[:, 0] == 1).all(), case
-        assert motion.events.count == sum(k in case for k in ("brake", "stop")), case
-    # What is no rounding error frees it: a rate, a load, a blow of slides that are not
-    # quite perpendicular.
-    for case, end in (
-        (dict(rate=1e-9), 2e-9 + 0.5), (dict(load=2.1), 1.1),
-        (dict(angle=np.pi / 2 - 1e-6) | brake, 0.125 * 1.3**2),
-    ):  # fmt: skip
-        motion = run(crossed(**case), [0, 2.0])
-        np.testing.assert_allclose(motion.q[-1, 0], end, rtol=1e-5)
-
-
-# Three of five joints throw each other at their stops a hundred times within 1e-3 s.
-CASCADE = dict(
-    q=[0.4127555772777217, 0.10663577576717986, 0.2294965609839984,
-       0.04362499146542287, 0.4350724237877682],
-    qd=[-0.1019495193972042, -1.9037264540263323, 2.829787525711607,
-        2.38619061070529, 2.7639893155816297],
-    stops=([-1.3650253838294104, -0.8621346523419489, -0.8407652751647515,
-            -0.6445447869409455, -0.8397591843599618],
-           [1.1158174343103087, 1.3086982603139599, 0.6632268532491,
-            0.8873668421341108, 0.9412615544639757]),
-    restitution=[0.49971664577198616, 0.7169891762068814, 0.2931325634466204,
-                 0.2772967188843861, 0.20989561789762632],
-)  # fmt: skip
-
-
-@pytest.mark.slow
-def test_a_cascade_of_blows_is_no_chatter():
-    links = dict(length=[0] + [0.4] * 5, com=[[0.2, 0.02]] * 5, inertia=[0.02] * 5)
-    scene = several("RRRRR", **CASCADE, gravity=G, **links)
-    motion = run(scene, [0, 4.0])
-    energy = [sum(fj.energy(scene.linkage, motion.q[k], motion.qd[k])) for k in (0, 1)]
-    np.testing.assert_allclose(energy[0] - energy[1], motion.taken[1], atol=1e-8)
-    assert motion.events.count > 20
-
-
-# One of two slides is held, which are parallel.
-PARALLEL = several(
-    "RPP", [0.3, -0.2, 0.1], [1.0, 0.5, 0.0], brake=(2, 0.1, LATER), gravity=G,
-    length=[0, 0.3, 1.2, 0.6], com=[[0, 0.5], [0.2, 0.1], [0.4, -0.3]],
-    mass=[2.3, 1.4, 0.7], inertia=[0.3, 0.5, 0.1], locked=[0.3, -0.4, 0.5],
-    base_angle=1.3,
-)  # fmt: skip
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [None, 2, 3, 18, 26, 33])  # of five joints
-def test_laws_of_random_scenes(seed):
-    """The books of energy close, held joints stand still, efforts stay in bounds."""
-    rng = np.random.default_rng(seed)
-    errors = held.law_errors(PARALLEL if seed is None else held.random_scene(rng))
-    assert max(errors.values()) <= 1, errors

@@ -2,19 +2,22 @@
 
 from functools import partial
 
-import diffrax
 import equinox as eqx
+import held_scenes as held
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from elements import SHORT, Swing
+from held_scenes import LATER, NEVER, Row
 from helpers import random_linkage
-from modes import LOOPS, jacobian
+from modes import LOOPS
 from scipy.integrate import simpson, solve_ivp
 
 import fdof_jax as fj
+from fdof_jax.simulation import PrescribedMotion
 
+pytestmark = pytest.mark.slow
 # A cart that slides along x and carries a pendulum: link 3 turns with link 4.
 LENGTH, MASS, INERTIA, G = 0.8, 1.5, 0.2, 9.81
 with pytest.warns(UserWarning, match="joints 2 and 3 coincide"):
@@ -23,78 +26,87 @@ with pytest.warns(UserWarning, match="joints 2 and 3 coincide"):
         mass=[2, 0, MASS], inertia=[1, INERTIA, 0], locked=[0, 0, 0],
         base_angle=-np.pi / 2, gravity=G,
     )  # fmt: skip
-FORWARD = diffrax.ForwardMode()
 ROTOR = MASS * LENGTH**2 + INERTIA
 REST = fj.State(np.zeros(3), np.zeros(3))
 NONE = fj.JointEffort(np.zeros(3))
 AMPLITUDE = jnp.array([0.3, 0.2, 0.4])
+PULSE = 6.0  # [rad/s]
 
 
-class Push(fj.references.Reference):
-    """The cart starts with a velocity and accelerates at a constant rate."""
+class Moved(fj.references.Reference):
+    """The first joint is accelerated or shaken, and at a time given a rate."""
 
-    velocity: fj.Values = fj.field((), unit="m/s")
-    acceleration: fj.Values = fj.field((), unit="m/s^2")
+    acceleration: fj.Values = fj.field((), unit="m/s^2", default=0.0)
+    shake: fj.Values = fj.field((), unit="m", default=0.0)
+    phase: fj.Values = fj.field((), unit="rad", default=0.0)
+    rate: fj.Values = fj.field((), unit="m/s", default=0.0)
+    begin: fj.Values = fj.field((), unit="s", default=0.0)
+
+    @property
+    def jump_ts(self):
+        return self.begin[None]
 
     def __call__(self, t, linkage):
-        x = self.velocity * t + self.acceleration * t**2 / 2
-        rate = self.velocity + self.acceleration * t
-        along = jnp.array([1.0, 0.0, 0.0])
-        return x * along, rate * along
+        after, angle = jnp.maximum(t - self.begin, 0), PULSE * t + self.phase
+        x = self.acceleration * t**2 / 2 + self.rate * after
+        x += self.shake * (jnp.sin(angle) - jnp.sin(self.phase))
+        speed = self.acceleration * t + PULSE * self.shake * jnp.cos(angle)
+        speed += jnp.where(t >= self.begin, self.rate, 0)
+        along = jnp.eye(linkage.mass.size)[0]
+        return x * along, speed * along
 
 
-def pushed(velocity, acceleration=0.0, joints=(1, 3)):
-    return fj.simulation.PrescribedMotion(joints, Push(velocity, acceleration))
+class Hidden(Moved):
+    """It declares no jump."""
+
+    jump_ts = None
+
+
+def pushed(joints=(1, 3), **moves):
+    return PrescribedMotion(joints, Moved(**moves))
 
 
 def pendulum(angle, rate, acceleration, ts):
     """Returns the motion of a pendulum whose pivot accelerates along x."""
 
-    def field(t, y):
+    def rates(t, y):
         drive = G * np.sin(y[0]) + acceleration * np.cos(y[0])
         return y[1], -MASS * LENGTH * drive / ROTOR
 
     options = dict(rtol=1e-12, atol=1e-13)
-    return solve_ivp(field, (0, ts[-1]), [angle, rate], "DOP853", ts, **options).y
+    angle, rate = solve_ivp(
+        rates, (0, ts[-1]), [angle, rate], "DOP853", ts, **options
+    ).y
+    return angle, rate, rates(0.0, (angle, rate))[1]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("acceleration", [0.0, 4.0])
-def test_a_pendulum_on_a_cart_that_accelerates(acceleration):
-    moving = pushed(0.0, acceleration)
-    ts = np.linspace(0, 3, 13)
-    solution = fj.simulate(CART, fj.State([0, 0.7, 0], np.zeros(3)), ts, (moving,))
-    angle, rate = pendulum(0.7, 0.0, acceleration, ts)
-    found = solution.q[:, 1], solution.qd[:, 1]
-    np.testing.assert_allclose(found, [angle, rate], atol=1e-9)
-    np.testing.assert_allclose(solution.q[:, 0], acceleration * ts**2 / 2, atol=1e-12)
-    np.testing.assert_array_equal(solution.q[:, 2], 0)
-
-
-@pytest.mark.slow
-def test_a_jump_of_the_velocity_is_a_blow():
-    """Checks that the pendulum's momentum about its pivot does not change."""
-    moving = pushed(0.6)
-    ts = np.linspace(0, 1, 6)
+@pytest.mark.parametrize("speed, acceleration", [(0, 0), (0, 4.0), (0.6, 0)])
+def test_a_pendulum_on_a_cart(speed, acceleration):
+    """A first speed is a blow, which keeps the momentum about the pendulum's pivot."""
+    moving, ts = pushed(acceleration=acceleration, rate=speed), np.linspace(0, 3, 13)
     start = fj.State([0, 0.4, 0], [0, 0.2, 0])
-    solution = fj.simulate(CART, start, ts, (moving,))
-    after = 0.2 - MASS * LENGTH * np.cos(0.4) * 0.6 / ROTOR
-    angle, rate = pendulum(0.4, after, 0.0, ts)
-    found = solution.q[:, 1], solution.qd[:, 1]
+    motion = fj.simulate(CART, start, ts, (moving,))
+    after = 0.2 - MASS * LENGTH * np.cos(0.4) * speed / ROTOR
+    angle, rate, turning = pendulum(0.4, after, acceleration, ts)
+    found = motion.q[:, 1], motion.qd[:, 1]
     np.testing.assert_allclose(found, [angle, rate], atol=1e-9)
-    np.testing.assert_allclose(solution.qd[:, 0], 0.6)
-    # The effort, too, is that after the blow: it moves the pendulum's mass centre.
-    turning = -MASS * LENGTH * G * np.sin(angle) / ROTOR
+    place = speed * ts + acceleration * ts**2 / 2
+    np.testing.assert_allclose(motion.q[:, 0], place, atol=1e-12)
+    np.testing.assert_allclose(motion.qd[:, 0], speed + acceleration * ts)
+    np.testing.assert_array_equal(motion.q[:, 2], 0)
+    # The effort, too, is that after the blow: it moves all mass centres.
     along_x = MASS * LENGTH * (np.cos(angle) * turning - np.sin(angle) * rate**2)
-    effort = fj.joint_efforts(CART, (moving,), solution).total[:, 0]
-    np.testing.assert_allclose(effort, along_x, atol=1e-7)
-    sampled = fj.simulate_sampled(CART, start, NONE, 0.2, 5, (moving,))
-    np.testing.assert_allclose(sampled.qd, solution.qd, atol=1e-9)
+    effort = fj.joint_efforts(CART, (moving,), motion).total[:, 0]
+    expected = along_x + (2 + MASS) * acceleration
+    np.testing.assert_allclose(effort, expected, atol=1e-7)
+    if speed:
+        sampled = fj.simulate_sampled(CART, start, NONE, 0.25, 12, (moving,))
+        np.testing.assert_allclose(sampled.qd, motion.qd, atol=1e-9)
 
 
 def swinging(topology, joints, forces=()):
     n, linkage = len(topology), random_linkage(topology, np.random.default_rng(3))
-    motion = fj.simulation.PrescribedMotion(joints, Swing(AMPLITUDE[:n]))
+    motion = PrescribedMotion(joints, Swing(AMPLITUDE[:n]))
     q, qd = motion.reference(0.0, linkage)
     effort = fj.JointEffort([1.0, -2.0, 0.7][:n])
     forces = (motion, fj.JointDamper(0.5), effort, *forces)
@@ -113,7 +125,6 @@ def along(linkage, forces, solution, efforts):
     return jax.vmap(at)(solution.ts, solution.q, solution.qd, efforts)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("joints", [1, 2, 3, (1, 2), (1, 2, 3)], ids=str)
 @pytest.mark.parametrize("topology", ["RRR", "RPR", "PRP"])
 def test_efforts_make_the_motion_and_do_its_work(topology, joints):
@@ -133,19 +144,8 @@ def test_efforts_make_the_motion_and_do_its_work(topology, joints):
     np.testing.assert_allclose(energy[-1] - energy[0], work, atol=1e-6 * np.ptp(power))
 
 
-@pytest.mark.slow
-def test_the_motor_moves_a_payload_while_it_is_there():
-    forces = pushed(0.0, 2.0, (1, 2, 3)), fj.forces.Payload(fj.Point(1), 3.0, end=0.35)
-    ts = np.linspace(0, 1, 11)
-    motion = fj.simulate(CART, REST, ts, forces)
-    effort = fj.joint_efforts(CART, forces, motion).elements[0, :, 0]
-    moved = 2 + MASS + np.where(ts < 0.35, 3, 0)
-    np.testing.assert_allclose(effort, 2 * moved, rtol=1e-12)
-
-
-@pytest.mark.slow
 def test_starts_beside_the_reference_and_singular_equations_are_told():
-    motion = pushed(0.0)
+    motion = PrescribedMotion((1, 3), Hidden())
     starts = fj.State(np.array([[0.0, 0.1, 0], [0.2, 0.1, 0]]), np.zeros((2, 3)))
     with pytest.raises(ValueError, match=r"state0\.q: expected \[0.0, .*prescribed"):
         fj.simulate(CART, fj.State(starts.q[1], np.zeros(3)), [0, 1], (motion,))
@@ -159,12 +159,10 @@ def test_starts_beside_the_reference_and_singular_equations_are_told():
         inertia=[1, 0.1, 0], gravity=0,
     )  # fmt: skip
     start = fj.State(np.array([0, 0.3, 0.0]), np.zeros(3))
-    slide = pushed(0.0, joints=1)
-    ended = fj.simulate(heavy, start, [0, 0.1], (slide,), throw=False)
+    ended = fj.simulate(heavy, start, [0, 0.1], (pushed(1),), throw=False)
     assert str(ended.outcome) == "ill-conditioned"
 
 
-@pytest.mark.slow
 def test_gradients_equal_differences():
     linkage, start, (motion, *others) = swinging("PR", 1)
     weights = np.array([1.0, -2.0])
@@ -175,7 +173,7 @@ def test_gradients_equal_differences():
         reference = Swing(AMPLITUDE[:2] * p[0])
         q, qd = reference(0.0, linkage)
         state0 = fj.State(jnp.where(motion.prescribes(linkage), q, start.q), start.qd)
-        forces = fj.simulation.PrescribedMotion(1, reference), fj.JointDamper(p[1])
+        forces = PrescribedMotion(1, reference), fj.JointDamper(p[1])
         return weights @ fj.simulate(linkage, state0, [0, 0.5], forces).q[-1]
 
     p = jnp.array([1.0, 0.5])
@@ -184,7 +182,6 @@ def test_gradients_equal_differences():
     np.testing.assert_allclose(slope, wanted, atol=1e-6 * np.abs(slope).max())
 
 
-@pytest.mark.slow
 def test_topologies_are_batched():
     """A rotor's inertia beside them takes the batch through the looped solver."""
     rotor = (fj.forces.Armature(np.array([0.3, 0.2])),)
@@ -197,9 +194,6 @@ def test_topologies_are_batched():
         np.testing.assert_allclose(swept.q[k], alone.q, atol=1e-9)
 
 
-HOLD = pushed(0.0)
-
-
 class Jerk(fj.references.Reference):
     """The cart starts at an infinite rate."""
 
@@ -208,9 +202,8 @@ class Jerk(fj.references.Reference):
         return jnp.sqrt(t) * along, along / (2 * jnp.sqrt(t))
 
 
-@pytest.mark.slow
 def test_a_motion_that_cannot_begin_reaches_no_time():
-    jerk = HOLD.replace(reference=Jerk())
+    jerk = PrescribedMotion((1, 3), Jerk())
     motion = fj.simulate(CART, REST, [0, 0.5, 1], (jerk,), throw=False)
     assert motion.outcome == "not finite" and motion.stats["time_reached"] == 0
 
@@ -223,190 +216,131 @@ with pytest.warns(UserWarning, match="parallel"):
         "PP", length=[0, 0, 0], com=[[0, 0], [0, 0]], mass=[5, 2], inertia=[1, 1],
         locked=[0, 0], base_angle=0.0, gravity=0.0,
     )  # fmt: skip
-LOAD = 2.0
+LOAD, BACK = 2.0, 0.5  # mass [kg], restitution
 
 
-class Kick(fj.references.Reference):
-    """The table stands still, and moves at a constant rate from a time on."""
-
-    rate: fj.Values = fj.field((), unit="m/s")
-    begin: fj.Values = fj.field((), unit="s")
-
-    @property
-    def jump_ts(self):
-        return self.begin[None]
-
-    def __call__(self, t, linkage):
-        moves, along = t >= self.begin, jnp.array([1.0, 0.0])
-        x = jnp.where(moves, self.rate * (t - self.begin), 0)
-        return x * along, jnp.where(moves, self.rate, 0) * along
-
-
-class Accelerated(Push):
-    def __call__(self, t, linkage):
-        x, rate = super().__call__(t, linkage)
-        return x[:2], rate[:2]
-
-
-def on_table(*forces, reference, joints=1, qd=(0.0, 0.0), ts=(0.0, 1.0, 2.0), **more):
-    moving = fj.simulation.PrescribedMotion(joints, reference)
-    start = fj.State(np.zeros(2), jnp.array([*qd]))
-    return fj.simulate(TABLE, start, jnp.asarray(ts), (moving, *forces), **more)
-
-
-@pytest.mark.slow
-def test_friction_takes_a_load_along_or_lets_it_slip():
-    friction = fj.forces.JointFriction([0.0, 3.0])
-    for acceleration, slip in ((1.49, 0.0), (1.6, -0.1)):  # it holds 1.5 m/s^2
-        motion = on_table(friction, reference=Accelerated(0.0, acceleration))
-        ts = motion.ts
-        np.testing.assert_allclose(motion.q[:, 0], acceleration * ts**2 / 2, atol=1e-12)
-        np.testing.assert_allclose(motion.q[:, 1], slip * ts**2 / 2, atol=1e-12)
-        forces = (
-            fj.simulation.PrescribedMotion(1, Accelerated(0.0, acceleration)),
-            friction,
-        )
-        efforts = fj.joint_efforts(TABLE, forces, motion)
-        taken = LOAD * (acceleration + slip)
-        np.testing.assert_allclose(efforts.elements[1, 1, 1], taken, atol=1e-9)
-        np.testing.assert_allclose(
-            efforts.total[1, 0], 5 * acceleration + taken, atol=1e-9
-        )
-
-
-@pytest.mark.slow
-def test_a_kicked_table_slips_under_its_load():
-    """The load slides back by m v^2 / (2 f) from the kick on, for a time m v / f."""
-
-    def end(x, ts, **options):
-        rate, begin, level = x
-        friction = fj.forces.JointFriction(level * jnp.array([0.0, 1.0]))
-        motion = on_table(friction, reference=Kick(rate, begin), ts=ts, **options)
-        return motion.q[-1, 1], motion
-
-    x, ts = jnp.array([0.9, 0.3, 4.0]), np.array([0.0, 1.0, 2.0])
-    forwards = jacobian(partial(end, adjoint=FORWARD))
-    (forward, _), (_, motion) = forwards(x, ts)
-    assert motion.events.table["event"].tolist() == ["slips", "sticks"]
-    np.testing.assert_allclose(motion.events.table["t [s]"], [0.3, 0.75], atol=1e-12)
-    np.testing.assert_allclose(motion.q[1:, 1], -LOAD * 0.9**2 / 8, atol=1e-12)
-    np.testing.assert_allclose(motion.taken[-1], LOAD * 0.9**2 / 2, atol=1e-11)
-    right = -LOAD * np.array([0.9 / 4, 0, -(0.9**2) / (2 * 4**2)])
-    np.testing.assert_allclose(forward, right, atol=1e-9)
-    reverse, _ = jax.jit(jax.grad(end, has_aux=True), **LOOPS)(x, ts)
-    np.testing.assert_allclose(reverse, right, atol=1e-9)
-    slides = lambda t: -0.9 * t + 4 * t**2 / (2 * LOAD)  # since the kick
-    (forward, _), (_, during) = forwards(x, np.array([0.0, 0.5, 0.6]))
-    np.testing.assert_allclose(during.q[-1, 1], slides(0.3), atol=1e-12)
-    np.testing.assert_allclose(
-        forward, [-0.3, 0.9 - 4 * 0.3 / LOAD, 0.045 / LOAD], atol=1e-9
+def on_table(
+    moving=Moved, *, qd=0.0, level=0.0, stop=-np.inf, brake=(NEVER, LATER),
+    taken=NEVER, **moves,
+):  # fmt: skip
+    """Returns a scene with all that may hold the load, most of which does nothing."""
+    reference = moving(**dict(begin=NEVER) | moves)
+    forces = (
+        PrescribedMotion(1, reference),
+        fj.forces.JointFriction(level * jnp.array([0.0, 1.0])),
+        fj.forces.HardStops(jnp.array([-np.inf, stop]), np.inf, restitution=BACK),
+        fj.forces.Brake(2, *brake),
+        fj.forces.Payload(fj.Point(2), 2.0, begin=taken),
     )
+    _, rates = reference(0.0, TABLE)
+    start = fj.State(jnp.zeros(2), jnp.stack([rates[0], qd]))
+    return jax.tree.map(jnp.asarray, fj.Scene(TABLE, start, forces, 0.0))
 
 
-SHAKE, PULSE = 0.1, 6.0  # amplitude [m], rad/s
+PULLED = lambda a, level: on_table(acceleration=a, level=level)
+KICKED = lambda rate, begin, level: on_table(rate=rate, begin=begin, level=level)
 
 
-class Shaken(fj.references.Reference):
-    phase: fj.Values = fj.field((), unit="rad")
-
-    def __call__(self, t, linkage):
-        along, angle = jnp.array([1.0, 0.0]), PULSE * t + self.phase
-        x = SHAKE * (jnp.sin(angle) - jnp.sin(self.phase))
-        return x * along, SHAKE * PULSE * jnp.cos(angle) * along
+def slipped(rate, begin, level):
+    """The load slides back by m v^2 / (2 f), for a time m v / f."""
+    energy = LOAD * rate**2 / 2
+    t = jnp.stack([begin, begin + LOAD * rate / level])
+    return dict(q=[-energy / level], modes=[1.0], taken=[energy], t=t)
 
 
-@pytest.mark.slow
-def test_a_load_slips_on_a_table_that_moves_sinusoidally():
-    """Its rate is a triangle; it turns where that of the table is as large.
+def shakes(half_periods, amplitude=0.1):
+    """Returns a row: the load's rate is a triangle that turns where it is the table's.
 
     It slips by 4 A sqrt(1 - (pi f / (2 m A w^2))^2) in each period.
     """
-    period = 2 * np.pi / PULSE
-    share = lambda level: np.pi * level / (2 * LOAD * SHAKE * PULSE**2)
+    share = lambda level: jnp.pi * level / (2 * LOAD * amplitude * PULSE**2)
 
-    def slipped(level):
+    def shaken(level):
         phase = -jnp.arccos(-share(level))
-        friction = fj.forces.JointFriction(level * jnp.array([0.0, 1.0]))
-        motion = on_table(
-            friction, reference=Shaken(phase), qd=(SHAKE * PULSE * jnp.cos(phase), 0.0),
-            ts=(0, period / 2, period, 3 * period), adjoint=FORWARD,
-        )  # fmt: skip
-        return motion.taken[1:] / level, motion
+        return on_table(shake=amplitude, phase=phase, level=level)
 
-    right = lambda level: (
-        4 * SHAKE * jnp.sqrt(1 - share(level) ** 2) * jnp.array([0.5, 1, 3])
-    )
-    at = lambda level: jax.jvp(slipped, (level,), (1.0,), has_aux=True)
-    distance, slope, motion = jax.jit(at, **LOOPS)(3.0)
-    np.testing.assert_allclose(distance, right(3.0), rtol=0, atol=1e-9)
-    back = [-right(3.0)[0], 0, 0]
-    np.testing.assert_allclose(motion.q[1:, 1], back, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(slope, jax.jacfwd(right)(3.0), rtol=0, atol=1e-9)
+    def exact(level):
+        half = 2 * amplitude * jnp.sqrt(1 - share(level) ** 2)
+        return dict(q=[-half * (half_periods % 2)], taken=[level * half * half_periods])
+
+    return Row(shaken, (3.0,), [0, half_periods * np.pi / PULSE], exact)
 
 
-@pytest.mark.slow
-def test_stops_and_brakes_beside_a_kicked_table():
-    never = np.array(9.0)  # after the end
-
-    def kicked(qd=0.0, stop=-np.inf, braked=never, taken=never):
-        """Returns a motion beside what holds; what does not act shares the program."""
-        upper = np.where(np.isfinite(stop), 1.0, np.inf)
-        stops = fj.forces.HardStops([-np.inf, stop], [np.inf, upper], restitution=0.5)
-        brake = fj.forces.Brake(2, begin=braked, end=braked + 1.3)
-        payload = fj.forces.Payload(fj.Point(2), 2.0, begin=taken)
-        forces = stops, brake, payload
-        return on_table(*forces, reference=Kick(0.9, 0.3), qd=(0.0, qd))
-
-    motion = kicked(stop=-0.18)
-    # It comes to the stop 0.2 s after the kick, and bounces off at half the rate.
-    np.testing.assert_allclose(motion.events.table["t [s]"], [0.5], atol=1e-12)
-    bounced = -0.18 + 0.45 * (np.array([1.0, 2.0]) - 0.5)
-    np.testing.assert_allclose(motion.q[1:, 1], bounced, atol=1e-11)
-    # A braked load moves with the table, and is left behind no more than it was.
-    motion = kicked(qd=0.1, braked=0.2)
-    np.testing.assert_allclose(motion.q[:, 1], [0, 0.02, 0.02], atol=1e-12)
-    assert not motion.qd[1:, 1].any()
-    # A payload beside it takes momentum of the load alone.
-    np.testing.assert_allclose(kicked(taken=0.6).qd[1:, 1], -0.9, atol=1e-12)
+def fallen(room, acceleration):
+    """A load bounces off a stop as a ball that falls, by the table's acceleration."""
+    blow = jnp.sqrt(2 * room / acceleration)
+    back, since = acceleration * blow * BACK, 1 - blow
+    q = -room + back * since - acceleration * since**2 / 2
+    return dict(q=[q], qd=[back - acceleration * since], t=[blow])
 
 
-@pytest.mark.slow
-def test_a_load_bounces_off_the_stop_of_an_accelerated_table():
-    """As a ball that falls, by the acceleration of the table."""
+DIFFERENTIABLE = {
+    "friction takes a load along": Row(
+        PULLED, (1.49, 3.0), [0, 2.0],
+        lambda *_: dict(q=[0.0], qd=[0.0], modes=[1.0], taken=[0.0]), [],
+    ),
+    "friction lets a load slip": Row(
+        PULLED, (1.6, 3.0), [0, 2.0],
+        lambda a, f: dict(q=[f - 2 * a], qd=[f - 2 * a], taken=[f * (2 * a - f)]),
+    ),
+    "a kicked table slips under its load": Row(
+        KICKED, (0.9, 0.3, 4.0), [0, 2.0], slipped, ["slips", "sticks"]
+    ),
+    "a kicked table still slips": Row(
+        KICKED, (0.9, 0.3, 4.0), [0, 0.6],
+        lambda v, t, f: dict(q=[f * (0.6 - t) ** 2 / (2 * LOAD) - v * (0.6 - t)]),
+    ),
+    "half a period of a shaken table": shakes(1),
+    "three periods of a shaken table": shakes(6),
+    "a load bounces off the stop of an accelerated table": Row(
+        lambda room, a: on_table(acceleration=a, stop=-room), (0.8, 3.0), [0, 1.0],
+        fallen,
+    ),
+    "a load bounces off the stop of a kicked table": Row(
+        lambda v, t, room: on_table(rate=v, begin=t, stop=-room), (0.9, 0.3, 0.18),
+        [0, 2.0], lambda v, t, room: dict(
+            q=[BACK * (v * (2 - t) - room) - room], qd=[BACK * v], t=[t + room / v]
+        ),
+    ),
+    "a braked load moves with the table, and is left behind no more": Row(
+        lambda t, qd: on_table(rate=0.9, begin=0.3, brake=(t, 1.5), qd=qd), (0.2, 0.1),
+        [0, 2.0], lambda t, qd: dict(q=[qd * t], qd=[0.0], taken=[LOAD * qd**2 / 2]),
+        ["is braked", "is let go"],
+    ),
+    "a payload beside it takes momentum of the load alone": Row(
+        lambda v, t: on_table(rate=v, begin=0.3, taken=t), (0.9, 0.6), [0, 2.0],
+        lambda v, t: dict(q=[-1.7 * v], qd=[-v]),
+    ),
+}  # fmt: skip
+HIDDEN = Row(
+    lambda v, t: on_table(Hidden, rate=v, begin=t), (0.9, 0.3), [0, 2.0],
+    lambda v, t: dict(q=[-v * (2 - t)]),
+)  # fmt: skip
+ROWS = DIFFERENTIABLE | {"a jump of the velocity that is not declared": HIDDEN}
 
-    def bounced(x):
-        room, acceleration = x
-        stop = fj.forces.HardStops(
-            -room * np.array([np.inf, 1]), np.inf, restitution=0.5
-        )
-        table = Accelerated(0.0, acceleration)
-        motion = on_table(stop, reference=table, ts=(0.0, 1.0), adjoint=FORWARD)
-        return jnp.stack([motion.q[-1, 1], motion.qd[-1, 1], motion.events.t[0]])
 
-    def exact(x):
-        room, acceleration = x
-        blow = jnp.sqrt(2 * room / acceleration)
-        back, since = acceleration * blow / 2, 1 - blow
-        q = -room + back * since - acceleration * since**2 / 2
-        return jnp.stack([q, back - acceleration * since, blow])
-
-    x = jnp.array([0.8, 3.0])
-    np.testing.assert_allclose(bounced(x), exact(x), atol=1e-11)
-    found = jax.jit(jax.jacfwd(bounced), **LOOPS)(x)
-    np.testing.assert_allclose(found, jax.jacfwd(exact)(x), atol=1e-9)
+@pytest.mark.parametrize("name", ROWS)
+def test_a_load_on_a_table(name):
+    held.check_motion(ROWS[name], name)
 
 
-def test_stops_and_brakes_of_prescribed_joints_are_refused():
-    for element in (fj.forces.HardStops(-1, 1), fj.forces.Brake(1, begin=0, end=1)):
-        with pytest.raises(ValueError, match="a joint whose motion is prescribed"):
-            on_table(element, reference=Kick(0.9, 0.3))
+def test_derivatives_of_all_these():
+    held.check_derivatives(DIFFERENTIABLE)
 
 
-@pytest.mark.slow
-def test_a_jump_of_the_velocity_that_is_not_declared_is_found():
-    class Hidden(Kick):
-        jump_ts = None
+def test_a_kicked_table_in_reverse_mode():
+    end = lambda x: fj.simulate(KICKED(*x), [0, 2.0]).q[-1, 1]
+    found = jax.jit(jax.grad(end), **LOOPS)(jnp.array([0.9, 0.3, 4.0]))
+    right = -LOAD * np.array([0.9 / 4, 0, -(0.9**2) / (2 * 4**2)])
+    np.testing.assert_allclose(found, right, atol=1e-9)
 
-    motion = on_table(reference=Hidden(0.9, 0.3))
-    slid = -0.9 * (np.array([1.0, 2.0]) - 0.3)
-    np.testing.assert_allclose(motion.q[1:, 1], slid, atol=1e-9)
+
+@pytest.mark.parametrize("acceleration, slip", [(1.49, 0.0), (1.6, -0.1)])
+def test_efforts_of_friction_and_of_what_moves_the_table(acceleration, slip):
+    scene, ts = PULLED(acceleration, 3.0), np.linspace(0, 2, 3)
+    motion = fj.simulate(scene, ts)
+    np.testing.assert_allclose(motion.q[:, 0], acceleration * ts**2 / 2, atol=1e-12)
+    efforts, taken = fj.joint_efforts(scene, motion), LOAD * (acceleration + slip)
+    np.testing.assert_allclose(efforts.elements[1, 1, 1], taken, atol=1e-9)
+    total = 5 * acceleration + taken
+    np.testing.assert_allclose(efforts.total[1, 0], total, atol=1e-9)

@@ -6,14 +6,14 @@ import diffrax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from elements import HOLDING
+from elements import BAR, HOLDING
 from test_package import NAMESPACES
 
 import fdof_jax as fj
 from fdof_jax import analysis
 from fdof_jax.pictures import drawing, plotting
+from fdof_jax.simulation.simulate import check_start
 
-BAR = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[1 / 12])
 REST = fj.State([0.3], [0.0])
 PD = fj.PDController(9.0, 1.0, np.inf, lambda t, linkage: (jnp.ones(1), jnp.zeros(1)))
 ROWS = jnp.zeros(1), jnp.array([[0.3]]), jnp.zeros((1, 1))
@@ -51,6 +51,20 @@ class Leaking(fj.forces.Payload):
         return fj.forces.Payload(self.place, self.mass - t)
 
 
+class Carried(fj.forces.InertialElement):
+    """A point mass of 2 kg without weight, which loads the tip of the bar."""
+
+    def coordinates(self, q, linkage):
+        return fj.tip_position(linkage, q)
+
+    def weights(self, linkage):
+        return 2 * jnp.ones(2)
+
+    def loads(self, t, q, qd, qdd, linkage):
+        push = -2 * self.accelerations(q, qd, qdd, linkage)
+        return (fj.forces.Load(fj.Point(1, 1.0), push),)
+
+
 def test_no_function_that_takes_forces_is_left_out():
     rooms = *NAMESPACES, drawing, plotting
     public = {getattr(room, name) for room in rooms for name in room.__all__}
@@ -76,12 +90,16 @@ def test_what_an_instant_cannot_know_is_refused(function):
 def test_loops_and_limits_of_held_joints_are_refused(element):
     with pytest.raises(ValueError, match="^controller: expected no element that holds"):
         analysis.open_loop(BAR, [0.3], element, 1)
-    scene, limits = (
-        fj.Scene(BAR, REST, (PD, element), 1.0),
-        fj.tuning.Limits(effort=1.0),
-    )
+    scene, limits = fj.Scene(BAR, REST, (PD, element), 1.0), fj.tuning.Limits(effort=1)
     with pytest.raises(ValueError, match=r"^forces\[1\]: expected no element that hol"):
         fj.tuning.tune_within(scene, limits, loss=fj.tuning.joint_errors)
+
+
+@pytest.mark.parametrize("element", HOLDERS[1:], ids=lambda e: type(e).__name__)
+def test_stops_and_brakes_of_prescribed_joints_are_refused(element):
+    still = fj.simulation.PrescribedMotion(1, PD.reference)
+    with pytest.raises(ValueError, match="a joint whose motion is prescribed"):
+        check_start((still, element), BAR, REST, np.array([0, 1]))  # by `simulate`
 
 
 def test_a_payload_counts_while_it_is_there():
@@ -99,13 +117,18 @@ def test_a_payload_counts_while_it_is_there():
     np.testing.assert_allclose(values, [1 / 3, 1 / 3 + 2 + 0.1], rtol=1e-14)
 
 
+def test_bearings_carry_what_an_own_element_declares():
+    """Beside a bar that turns at 3 rad/s and carries it at its tip."""
+    turns = fj.Solution(*ROWS[:2], jnp.array([[3.0]]), {}, diffrax.RESULTS.successful)
+    found = fj.joint_reactions(BAR.replace(gravity=0), (Carried(),), turns)[0, 0]
+    pull = -(0.5 + 2) * 3**2 * np.array([np.cos(0.3), np.sin(0.3)])
+    np.testing.assert_allclose(found, [*pull, 0], atol=1e-12)
+
+
 def test_what_holds_joints_adds_no_mass_and_no_energy():
     held = tuple(HOLDING[name] for name in ("sticking friction", "hard stops", "brake"))
     arm, q = fj.scenes.fig7().linkage, [0.1, 0.2, 0.3]
-    for function, *state in (
-        (fj.mass_matrix, q),
-        (fj.bias_force, q, q),
-        (fj.energy, q, q),
-    ):
+    for function, count in (fj.mass_matrix, 1), (fj.bias_force, 2), (fj.energy, 2):
+        state = [q] * count
         given, bare = function(arm, *state, held), function(arm, *state)
         np.testing.assert_array_equal(given, bare)

@@ -81,15 +81,12 @@ def test_derivatives_keep_a_pose_and_follow_it(topology):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "topology, inside, path",
-    [
-        ("RRR", -1, lambda s, a: [s * np.cos(a), s * np.sin(a)]),  # outstretched
-        ("RPR", 1, lambda s, a: [s * np.cos(a), s * np.sin(a)]),  # within its offset
-        ("PRR", -1, lambda s, a: [s, a]),  # link 3 level
-        ("RRP", -1, lambda s, a: [s * np.cos(0.2), s * np.sin(0.2)]),  # along link 2
-    ],
-)
+@pytest.mark.parametrize("topology, inside, path", [
+    ("RRR", -1, lambda s, a: [s * np.cos(a), s * np.sin(a)]),  # outstretched
+    ("RPR", 1, lambda s, a: [s * np.cos(a), s * np.sin(a)]),  # within its offset
+    ("PRR", -1, lambda s, a: [s, a]),  # link 3 level
+    ("RRP", -1, lambda s, a: [s * np.cos(0.2), s * np.sin(0.2)]),  # along link 2
+])  # fmt: skip
 def test_the_edge_of_the_reach(topology, inside, path):
     """Beyond it tips are refused or NaN; at it there is no number for a derivative."""
     linkage, edge = UNIT.replace(topology=topology), 2  # the two lengths together
@@ -120,24 +117,19 @@ def test_a_folded_arm_is_back_at_its_pivot():
         np.testing.assert_allclose(fj.tip_position(UNIT, q), tip, atol=1e-15)
 
 
-PARALLEL, COUNT = (
-    "^tip: .*, and two slides that are parallel",
-    "^linkage: expected {} j",
-)
+PARALLEL = "^tip: .*, and two slides that are parallel"
+COUNT = "^linkage: expected {} j"
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
-@pytest.mark.parametrize(
-    "topology, locked, orientation, words",
-    [
-        ("PPR", [np.pi, 0, 0], 0.2, PARALLEL),
-        ("RPP", [0, 0, 0.3], 0.2, PARALLEL),
-        ("PRP", [0, 0, 0], 0.3, PARALLEL),  # where the tip keeps the ground's direction
-        ("PPP", [0.5, 0.7, 0.3], 0.3, "^linkage: expected a joint that turns"),
-        *((name, 0, 0.3, COUNT.format(3)) for name in ("R", "RFP", "FRRFPR")),
-        *((name, 0, None, COUNT.format(2)) for name in ("R", "RRR")),
-    ],
-)
+@pytest.mark.parametrize("topology, locked, orientation, words", [
+    ("PPR", [np.pi, 0, 0], 0.2, PARALLEL),
+    ("RPP", [0, 0, 0.3], 0.2, PARALLEL),
+    ("PRP", [0, 0, 0], 0.3, PARALLEL),  # where the tip keeps the ground's direction
+    ("PPP", [0.5, 0.7, 0.3], 0.3, "^linkage: expected a joint that turns"),
+    *((name, 0, 0.3, COUNT.format(3)) for name in ("R", "RFP", "FRRFPR")),
+    *((name, 0, None, COUNT.format(2)) for name in ("R", "RRR")),
+])  # fmt: skip
 def test_arms_that_reach_no_given_pose(topology, locked, orientation, words):
     arm = chains.random_chain(topology, np.random.default_rng(9))
     arm = arm.replace(locked=locked, base_angle=0.3)

@@ -1,5 +1,7 @@
 """Linkages as data: existence factors, coordinates, copies."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,14 +18,11 @@ SHAPES = dict(
 
 def make(topology="RRR", **changes):
     arguments = dict(
-        length=[0.5, 1, 1.2, 0.8],
-        com=[[0.4, 0.1], [0.6, -0.2], [0.3, 0.1]],
-        mass=[2, 1.5, 1],
-        inertia=[0.2, 0.1, 0.3],
-        locked=[0.1, 0.7, -0.4],
+        length=[0.5, 1, 1.2, 0.8], com=[[0.4, 0.1], [0.6, -0.2], [0.3, 0.1]],
+        mass=[2, 1.5, 1], inertia=[0.2, 0.1, 0.3], locked=[0.1, 0.7, -0.4],
         base_angle=0.3,
-    )
-    return fj.Linkage(topology, **{**arguments, **changes})
+    )  # fmt: skip
+    return fj.Linkage(topology, **arguments | changes)
 
 
 def test_existence_factors_spell_the_topology_and_stand_for_its_name():
@@ -61,9 +60,7 @@ def test_chain_coordinates_written_out_and_their_inverse(topology):
         expected += [[slide, slide_rate], [angle, rate]]
     np.testing.assert_allclose(np.stack([x, xd], axis=1), expected, atol=1e-14)
     for given in (topology, linkage.ef):
-        of = lambda x, xd, given=given: fj.paper.from_chain(
-            given, x, xd, linkage.base_angle
-        )
+        of = partial(fj.paper.from_chain, given, base_angle=linkage.base_angle)
         for locked, state in (of(x, xd), jax.jit(of)(x, xd)):
             np.testing.assert_allclose(locked, linkage.locked, atol=1e-13)
             np.testing.assert_allclose(state, (q, qd), atol=1e-13)

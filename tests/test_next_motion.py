@@ -5,10 +5,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from elements import BAR
 
 import fdof_jax as fj
 from fdof_jax.identification import design
 
+pytestmark = pytest.mark.slow
 TS, KNOTS, NOISE = np.linspace(0, 1, 51), np.linspace(0, 1, 3), 1e-3
 START = fj.State(jnp.array([-1.5]), jnp.zeros(1))
 
@@ -19,9 +21,7 @@ class Pushed(eqx.Module):
     efforts: jax.Array
 
     def __call__(self, p):
-        linkage = fj.Linkage(
-            "R", length=[0, 1], com=[[0.5, 0]], mass=p["mass"][None], inertia=[0.2]
-        )
+        linkage = BAR.replace(mass=p["mass"][None], inertia=[0.2])
         efforts = fj.forces.EffortHistory(KNOTS, self.efforts)
         return fj.Scene(linkage, START, (efforts, fj.JointDamper(p["damping"])), 1.0)
 
@@ -60,7 +60,6 @@ def relative(found):
     return np.sqrt(np.diag(found.covariance)) / np.abs(values)
 
 
-@pytest.mark.slow
 def test_the_next_fit_has_the_standard_errors_expected(found, chosen):
     assert chosen.improvement > 3
     first, then = Pushed(HANGS["efforts"]), Pushed(chosen.motion["efforts"])
@@ -79,7 +78,6 @@ def test_the_next_fit_has_the_standard_errors_expected(found, chosen):
     assert f"{chosen.motion['efforts'][0, 0]:.4g}" in str(chosen)
 
 
-@pytest.mark.slow
 def test_the_gradient_of_the_largest_standard_error(found, chosen, monkeypatch):
     """By central differences, half way between the first motion and the chosen one."""
     seen = []
@@ -94,7 +92,6 @@ def test_the_gradient_of_the_largest_standard_error(found, chosen, monkeypatch):
     np.testing.assert_allclose(at(z).gradient[0], slopes, rtol=1e-3, atol=least)
 
 
-@pytest.mark.slow
 def test_parameters_that_nothing_has_told_yet(found):
     """An infinite standard error of one number leaves what is known of the others."""
     covariance = found.covariance.copy()
@@ -105,8 +102,7 @@ def test_parameters_that_nothing_has_told_yet(found):
     np.testing.assert_allclose(known[1:, 1:], expected, rtol=1e-4)
     np.testing.assert_array_equal(known[0], [1e-6, 0])
     untold = eqx.tree_at(lambda found: found.covariance, found, covariance)
-    chosen = fj.identification.next_motion(
-        Pushed, untold, HANGS, TS, max_steps=5, **LIMITS
-    )
+    options = dict(max_steps=5) | LIMITS
+    chosen = fj.identification.next_motion(Pushed, untold, HANGS, TS, **options)
     assert chosen.improvement == np.inf
     assert np.isfinite(chosen.standard_errors["mass"])

@@ -27,6 +27,14 @@ def end_of(scene, **options):
     return jax.tree.map(lambda row: row[-1], diffrax.diffeqsolve(*run, **options).ys)
 
 
+def compare(found, motion, **bounds):
+    (q, qd, own), states = found, jax.tree.leaves(motion.own)
+    np.testing.assert_allclose(q, motion.q[-1], atol=1e-8)
+    np.testing.assert_allclose(qd, motion.qd[-1], atol=1e-7)
+    last = [[], *(np.ravel(rows[-1]) for rows in states)]
+    np.testing.assert_allclose(own, np.concatenate(last), **bounds)
+
+
 def test_diffrax_moves_all_topologies_as_simulate_does_in_one_program():
     traces = []
 
@@ -38,12 +46,7 @@ def test_diffrax_moves_all_topologies_as_simulate_does_in_one_program():
     for topology in fj.TOPOLOGIES:
         forces = elements.ALL["PD"], elements.ALL["PID"]
         scene = fj.Scene(elements.arm(topology), elements.START, forces, 0.5)
-        q, qd, own = end(scene)
-        motion = fj.simulate(scene, [0, 0.5])
-        np.testing.assert_allclose(q, motion.q[-1], atol=1e-8)
-        np.testing.assert_allclose(qd, motion.qd[-1], atol=1e-7)
-        states = [np.ravel(rows[-1]) for rows in jax.tree.leaves(motion.own)]
-        np.testing.assert_allclose(own, np.concatenate(states), atol=1e-8)
+        compare(end(scene), fj.simulate(scene, [0, 0.5]), atol=1e-8)
     assert len(traces) == 1
 
 
@@ -52,19 +55,13 @@ def test_diffrax_moves_all_topologies_as_simulate_does_in_one_program():
 def test_diffrax_moves_all_elements_as_simulate_does(kind):
     forces = tuple(FREE[kind].values())
     scene = fj.Scene(elements.arm("RPR"), elements.START, forces, 0.3)
-    q, qd, own = end_of(scene)
-    motion = fj.simulate(scene, [0, 0.3])
-    np.testing.assert_allclose(q, motion.q[-1], atol=1e-8)
-    np.testing.assert_allclose(qd, motion.qd[-1], atol=1e-7)
-    states = [np.ravel(rows[-1]) for rows in jax.tree.leaves(motion.own)]
-    np.testing.assert_allclose(own, np.concatenate([[], *states]), atol=1e-7)
+    compare(end_of(scene), fj.simulate(scene, [0, 0.3]), atol=1e-7)
 
 
 @pytest.mark.slow
 def test_an_event_of_diffrax_ends_a_motion():
     """A uniform bar falls from level at rest: at the bottom its rate is known."""
-    bar = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[1 / 12])
-    scene = fj.Scene(bar, fj.State([0.0], [0.0]), (), 5.0)
+    scene = fj.Scene(elements.BAR, fj.State([0.0], [0.0]), (), 5.0)
     term, y0, args = fj.simulation.ode_term(scene)
     bottom = diffrax.Event(
         lambda t, y, args, **_: y[0][0] + np.pi / 2, optimistix.Newton(1e-10, 1e-10)
@@ -81,9 +78,7 @@ def test_an_event_of_diffrax_ends_a_motion():
 def test_white_torque_has_the_stationary_variance_of_a_damped_bar():
     """It is sigma^2 / (2 d k) of a bar with torsional spring k and damping d."""
     inertia, stiffness, damping, sigma = 1 / 3, 2.0, 0.8, 0.3
-    bar = fj.Linkage(
-        "R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[1 / 12], gravity=0.0
-    )
+    bar = elements.BAR.replace(gravity=0.0)
     forces = fj.forces.JointSpring(stiffness), fj.JointDamper(damping)
     scene = fj.Scene(bar, fj.State([0.0], [0.0]), forces, 8.0)
     drift, y0, args = fj.simulation.ode_term(scene)

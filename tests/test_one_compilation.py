@@ -23,14 +23,10 @@ def linkage_and_state(topology):
     moving = topology.replace("F", "R")
     locked, state = fj.paper.from_chain(moving, START, np.zeros(6), base_angle=0.2)
     linkage = fj.Linkage(
-        topology,
-        length=[0.1, 1.0, 0.8, 0.5],
-        com=[[0.5, 0.1], [0.4, -0.1], [0.25, 0]],
-        mass=[2, 1.5, 1],
-        inertia=[0.2, 0.1, 0.05],
-        locked=locked,
-        base_angle=0.2,
-    )
+        topology, length=[0.1, 1.0, 0.8, 0.5], mass=[2, 1.5, 1],
+        com=[[0.5, 0.1], [0.4, -0.1], [0.25, 0]], inertia=[0.2, 0.1, 0.05],
+        locked=locked, base_angle=0.2,
+    )  # fmt: skip
     return linkage, state
 
 
@@ -46,49 +42,33 @@ def circle(linkage, state):
     return fj.PDController([40.0] * 3, [4.0] * 3, [200.0] * 3, task)
 
 
-FIXED = "RFR", "FRP"  # which no circle is for
-FORCES = {
-    "no elements": lambda linkage, state: (),
-    "PD circle, damper and effort": lambda linkage, state: (
-        circle(linkage, state),
-        fj.JointDamper([1.0, 2.0, 3.0]),
-        fj.JointEffort([0.5, -1.0, 0.2]),
-    ),
-}
+def members(on_circles):
+    for topology in fj.TOPOLOGIES if on_circles else (*fj.TOPOLOGIES, "RFR", "FRP"):
+        linkage, state = linkage_and_state(topology)
+        more = fj.JointDamper([1.0, 2.0, 3.0]), fj.JointEffort([0.5, -1.0, 0.2])
+        yield linkage, state, (circle(linkage, state), *more) if on_circles else ()
 
 
-def members(kind):
-    names = fj.TOPOLOGIES + (FIXED if kind == "no elements" else ())
-    pairs = [linkage_and_state(topology) for topology in names]
-    return [(linkage, state, FORCES[kind](linkage, state)) for linkage, state in pairs]
+# Fixed steps: adaptive ones may round differently in a batch.
+STEPS = dict(stepsize_controller=diffrax.ConstantStepSize(), dt0=0.005)
 
 
-@pytest.mark.parametrize("kind", FORCES)
-def test_one_trace_and_batch_equals_singles(kind):
+@pytest.mark.parametrize("on_circles", [False, True])
+def test_one_trace_and_batch_equals_singles(on_circles):
     traces = []
-
-    # The default solver of batches takes long to compile: once is enough. It takes the
-    # same steps.
-    default = None if kind == "no elements" else LoopedDopri8()
 
     def motion(linkage, state, forces, solver=LoopedDopri8()):
         traces.append(1)
-        # Fixed steps: adaptive ones may round differently in a batch.
-        return fj.simulate(
-            linkage,
-            state,
-            TS,
-            forces,
-            solver=solver,
-            stepsize_controller=diffrax.ConstantStepSize(),
-            dt0=0.005,
-        )
+        return fj.simulate(linkage, state, TS, forces, solver=solver, **STEPS)
 
-    single = jax.jit(motion)
-    alone = [single(*member) for member in members(kind)]
+    single, scenes = jax.jit(motion), [*members(on_circles)]
+    alone = [single(*scene) for scene in scenes]
     assert len(traces) == 1
-    batched = jax.jit(jax.vmap(functools.partial(motion, solver=default)))
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *members(kind))
+    # The default solver of batches takes long to compile: once is enough. It takes the
+    # same steps.
+    options = {} if on_circles else dict(solver=None)
+    batched = jax.jit(jax.vmap(functools.partial(motion, **options)))
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *scenes)
     together = batched(*stacked)
     reversed_order = batched(*jax.tree.map(lambda a: a[::-1], stacked))
     assert len(traces) == 2

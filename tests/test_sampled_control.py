@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from elements import SHORT as STEPS
+from elements import BAR, FORWARD, SHORT as STEPS
 from figures import tidy as tidy, values
 from modes import ADJOINT, LOOPS, jacobian
 
@@ -14,9 +14,7 @@ from fdof_jax import plotting
 from fdof_jax.simulation.sampled_control import _in_periods
 
 # I qdd = tau.
-DISC = fj.Linkage(
-    "R", length=[0, 0], com=[[0, 0]], mass=[1], inertia=[2.0], gravity=0.0
-)
+DISC = BAR.replace(com=[[0, 0]], inertia=[2.0], gravity=0.0)
 STILL = fj.State(np.zeros(1), np.zeros(1))
 RODS = fj.Linkage(
     "RR", length=[0, 1, 1], com=[[0.5, 0]] * 2, mass=[1] * 2, inertia=[1 / 12] * 2
@@ -24,7 +22,6 @@ RODS = fj.Linkage(
 BENT = fj.State(np.array([-0.5, 0.3]), np.array([0.3, -0.2]))
 TURN = fj.references.JointMove(BENT.q, [0.5, 0.6], fj.references.Travel(1.0))
 CONTROL = fj.PDController([100.0, 50.0], [20.0, 10.0], np.inf, TURN)
-FORWARD = diffrax.ForwardMode()
 
 
 @pytest.mark.slow
@@ -139,12 +136,13 @@ def test_a_delay_of_whole_periods_is_known_in_either_precision(precision):
 def test_constant_steps_have_derivatives_in_period_and_delay_by_the_adjoint():
     """The disc's effort of 1 N m begins to act after the delay."""
 
+    steps = dict(stepsize_controller=diffrax.ConstantStepSize(), dt0=0.011)
+
     def turned(times):
         period, delay = times
-        return fj.simulate_sampled(
-            DISC, STILL, lambda t, q, qd, linkage: jnp.ones(1), period, 3, delay=delay,
-            stepsize_controller=diffrax.ConstantStepSize(), dt0=0.011, adjoint=ADJOINT,
-        ).q[-1, 0]  # fmt: skip
+        scene = DISC, STILL, lambda t, q, qd, linkage: jnp.ones(1), period, 3
+        options = dict(delay=delay, adjoint=ADJOINT) | steps
+        return fj.simulate_sampled(*scene, **options).q[-1, 0]
 
     q, slopes = jax.jit(jax.value_and_grad(turned), **LOOPS)(jnp.array([0.1, 0.03]))
     time = 3 * 0.1 - 0.03
@@ -160,7 +158,7 @@ def test_a_sample_sees_what_a_blow_leaves():
     def commands(gain):
         brakes = lambda t, q, qd, linkage: -gain * qd
         scene = DISC, fj.State([1.0], [0.2]), brakes, 0.125, 4, (load,)
-        return fj.simulate_sampled(*scene, adjoint=FORWARD).tau[:, 0]
+        return fj.simulate_sampled(*scene, **FORWARD).tau[:, 0]
 
     both = jax.jit(lambda x: jax.jvp(commands, (x,), (1.0,)), **LOOPS)
     expected = [-0.4, -0.35, -0.153125, -0.1435546875]
@@ -178,6 +176,18 @@ def test_no_time_is_left_out_at_samples():
     np.testing.assert_allclose(motion.q[-1], motion.ts[-1] - t0, rtol=1e-9)
 
 
+def test_a_fixed_pair_behind_the_disc_changes_nothing():
+    fixed = dict(length=[0, 0, 0], com=[[0, 0]] * 2, mass=[1, 0], inertia=[2.0, 0])
+    arm, still = fj.Linkage("RF", gravity=0.0, **fixed), fj.State([0, 0], [0, 0])
+    ramp = lambda t, q, qd, linkage: (1 + t) * jnp.ones(2)
+    motion = fj.simulate_sampled(arm, still, ramp, 0.1, 5, **STEPS)
+    assert not motion.tau[:, 1].any()
+    gains = np.cumsum(0.1 * np.array([0, 1, 1.1, 1.2, 1.3, 1.4]) / 2)
+    np.testing.assert_allclose(motion.qd, np.outer(gains, [1, 0]), atol=1e-14)
+    q = np.append(0, np.cumsum((gains[1:] + gains[:-1]) * 0.1 / 2))
+    np.testing.assert_allclose(motion.q, np.outer(q, [1, 0]), atol=1e-14)
+
+
 @pytest.mark.slow
 def test_a_digital_pid_controller_takes_euler_steps():
     hold = lambda t, linkage: (jnp.ones(1), jnp.zeros(1))
@@ -191,11 +201,12 @@ def test_a_digital_pid_controller_takes_euler_steps():
 @pytest.mark.slow
 def test_noise_is_what_the_key_says():
     seen = lambda t, q, qd, linkage: q + 10 * qd
-    run = lambda seed: fj.simulate_sampled(
-        RODS, fj.State(np.zeros(2), np.zeros(2)), seen, 1e-6, 400,
-        noise=(0.1, [0.02, 0.0]), key=jax.random.key(seed), **STEPS,
-    )  # fmt: skip
-    first, same, other = run(1), run(1), run(2)
+    scene = RODS, fj.State(np.zeros(2), np.zeros(2)), seen, 1e-6, 400
+    options = dict(noise=(0.1, [0.02, 0.0])) | STEPS
+    first, same, other = (
+        fj.simulate_sampled(*scene, key=jax.random.key(seed), **options)
+        for seed in (1, 1, 2)
+    )
     np.testing.assert_array_equal(first.tau, same.tau)
     assert not np.array_equal(first.tau, other.tau)
     expected = [np.hypot(0.1, 0.2), 0.1]
@@ -228,9 +239,8 @@ def test_joints_are_held_between_samples():
         start = fj.State(BENT.q + q0 * np.array([1, 0]), BENT.qd)
         forces = fj.forces.JointFriction(level, level + 0.3), limits
         control = CONTROL.replace(kp=gain * CONTROL.kp)
-        motion = fj.simulate_sampled(
-            RODS, start, control, period, 24, forces, delay=delay, adjoint=FORWARD
-        )
+        scene = RODS, start, control, period, 24, forces
+        motion = fj.simulate_sampled(*scene, delay=delay, **FORWARD)
         last = motion.q[-1], motion.qd[-1], motion.tau[20]
         return jnp.concatenate([*last, motion.taken[-1:], motion.events.t[:2]])
 

@@ -2,18 +2,17 @@
 
 import functools
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from elements import FORWARD, SLIDE
 from helpers import Push
 from jax.flatten_util import ravel_pytree
 from modes import ADJOINT, jacobian
 
 import fdof_jax as fj
 
-SLIDE = fj.Linkage("P", mass=[1], com=[[0, 0]], inertia=[1], length=[0, 1], gravity=0)
 TS = np.linspace(-0.55, 2.0, 26)  # none at a jump, where differences are none
 W = 10.0  # of the loop, critically damped [rad/s]
 
@@ -64,8 +63,7 @@ def test_a_loop_answers_as_closed_forms_say(reference, exact):
     numbers, whole = ravel_pytree(reference)
     right = lambda x: np.squeeze(exact(*jax.tree.leaves(whole(x))))
 
-    forward = lambda x: places(whole(x), adjoint=diffrax.ForwardMode())
-    found, q = jacobian(forward)(numbers)
+    found, q = jacobian(lambda x: places(whole(x), **FORWARD))(numbers)
     np.testing.assert_allclose(q, right(numbers), atol=1e-8)
     h = 1e-5
     steps = h * np.eye(numbers.size)
@@ -78,9 +76,8 @@ def test_a_loop_answers_as_closed_forms_say(reference, exact):
 
 def test_a_step_is_at_0_s_by_default():
     step = fj.references.Step(0.3, 0.7)
-    assert [float(step(t, SLIDE)[0][0]) for t in (-1, -1e-9, 0, 1)] == [
-        0.3, 0.3, 0.7, 0.7,
-    ]  # fmt: skip
+    places = [float(step(t, SLIDE)[0][0]) for t in (-1, -1e-9, 0, 1)]
+    assert places == [0.3, 0.3, 0.7, 0.7]
 
 
 def test_ramps_stand_before_and_after_their_times():
@@ -97,39 +94,47 @@ def test_ramps_stand_before_and_after_their_times():
 # Jumps that throw a controller past its limit, at once
 
 
+def motor(reference, kp=100.0, kd=0.0, limit=10.0):
+    return fj.PDController([kp], [kd], limit, reference)
+
+
+def place(*forces, speed=0.0, end=0.5, **options):
+    """Returns where a slide is that starts at 0 m."""
+    start = fj.State([0.0], [speed])
+    return fj.simulate(SLIDE, start, [0, end], forces, **options).q[-1, 0]
+
+
+def step_at(begin):
+    return motor(fj.references.Step([0.0], [1.0], begin=begin))
+
+
 def saturating(begin, **options):
-    """Returns where a slide is that 10 N have pushed since the step: a closed form."""
-    step = fj.references.Step([0.0], [1.0], begin=begin)
-    pd = fj.PDController([100.0], [0.0], 10.0, step)
-    start = fj.State([0.0], [0.0])
-    return fj.simulate(SLIDE, start, [0, 0.5], (pd,), **options).q[-1, 0]
+    """10 N have pushed since the step: a closed form."""
+    return place(step_at(begin), **options)
+
+
+def pulse(end, begin=0.1, kd=1.0):
+    """A pulse saturates a controller on both of its sides."""
+    return motor(fj.references.Pulse([0.0], [1.0], begin=begin, end=end), kd=kd)
 
 
 @pytest.mark.slow
 def test_the_times_of_jumps_past_a_limit_have_derivatives_beside_the_motion():
     """A jump past a limit is a kink that the controller passes at once."""
     start, ts = fj.State([0.0], [0.0]), jnp.array([0.0, 0.5])
-
-    def scene_at(z):
-        pulse = fj.references.Pulse([0.0], [1.0], begin=z[0], end=z[1])
-        pd = fj.PDController([100.0], [0.0], 10.0, pulse)
-        return fj.Scene(SLIDE, start, (pd,), 0.5)
-
-    def place(z):
-        return fj.simulate(scene_at(z), ts).q[-1, 0]
-
+    scene_at = lambda z: fj.Scene(SLIDE, start, (pulse(z[1], z[0], 0.0),), 0.5)
+    end = lambda z: fj.simulate(scene_at(z), ts).q[-1, 0]
     last = lambda _, motion: motion.q[-1]
     beside = jax.jit(lambda z: fj.simulation.sensitivities(scene_at, last, z, ts))
     for times in ([0.1, 9.0], [0.2, 9.0], [0.05, 0.1], [0.05, 0.2]):
         z = jnp.array(times)
-        slopes = [(place(z + h) - place(z - h)) / 2e-5 for h in 1e-5 * np.eye(2)]
+        slopes = [(end(z + h) - end(z - h)) / 2e-5 for h in 1e-5 * np.eye(2)]
         np.testing.assert_allclose(beside(z).jacobian[0], slopes, rtol=1e-4, atol=1e-9)
 
 
 def forward(begin):
     """Returns the value and the derivative."""
-    motion = functools.partial(saturating, adjoint=diffrax.ForwardMode())
-    return jax.jvp(motion, (begin,), (1.0,))
+    return jax.jvp(functools.partial(saturating, **FORWARD), (begin,), (1.0,))
 
 
 @pytest.mark.slow
@@ -151,53 +156,39 @@ def test_the_adjoint_has_them():
 
 
 @pytest.mark.slow
-def test_each_of_two_jumps_at_one_time_has_its_own_derivative():
+@pytest.mark.parametrize("order", [1, -1])
+def test_each_of_two_jumps_at_one_time_has_its_own_derivative(order):
     """Also where one of them passes a limit at once, whichever is listed first."""
-
-    def place(begins, order):
-        step = fj.references.Step([0.0], [1.0], begin=begins[1])
-        pd = fj.PDController([100.0], [0.0], 10.0, step)
-        forces = (Push(begins[0], 3.0), pd)[::order]
-        start = fj.State([0.0], [0.0])
-        return fj.simulate(SLIDE, start, [0, 0.5], forces).q[-1, 0]
-
-    for order in (1, -1):
-        slopes = jax.jit(jax.grad(functools.partial(place, order=order)))
-        for later in (0.0, 2e-15, 1e-12):  # a few units of rounding, and many
-            found = slopes(jnp.array([0.3, 0.3 + later]))
-            np.testing.assert_allclose(found, [-3 * 0.2, -10 * 0.2], rtol=1e-9)
+    forces = lambda begins: (Push(begins[0], 3.0), step_at(begins[1]))[::order]
+    slopes = jax.jit(jax.grad(lambda begins: place(*forces(begins))))
+    for later in (0.0, 2e-15, 1e-12):  # a few units of rounding, and many
+        found = slopes(jnp.array([0.3, 0.3 + later]))
+        np.testing.assert_allclose(found, [-3 * 0.2, -10 * 0.2], rtol=1e-9)
 
 
 def blow(begin):
-    """Returns the end of a slide that a payload slows, so that its motor saturates."""
-    hurry = fj.references.SetPoint(0.0, 1.0)
-    motor = fj.PDController(0.0, 100.0, 1.0, hurry)
+    """A payload slows the slide, so that its motor saturates."""
     load = fj.forces.Payload(fj.Point(1, 0.0), mass=1.0, begin=begin)
-    start = fj.State([0.0], [1.0])
-    return fj.simulate(SLIDE, start, [0, 0.5], (motor, load)).q[-1, 0]
+    return motor(fj.references.SetPoint(0.0, 1.0), 0.0, 100.0, 1.0), load
 
 
 def stopped(begin):
     """Returns the end of two bars; a brake's blow saturates the other one's motor."""
     arm = fj.scenes.double_pendulum().linkage.replace(gravity=0.0)
-    motor = fj.PDController([50.0, 0.0], [5.0, 0.0], [3.0, 0.0], lambda t, arm: (
-        jnp.array([t, 0.0]), jnp.array([1.0, 0.0])
-    ))  # fmt: skip
-    brake = fj.forces.Brake(2, begin=begin)
+    turn = lambda t, arm: (jnp.array([t, 0.0]), jnp.array([1.0, 0.0]))
+    forces = (
+        fj.PDController([50.0, 0.0], [5.0, 0.0], [3.0, 0.0], turn),
+        fj.forces.Brake(2, begin=begin),
+    )
     start = fj.State([0.0, 0.5], [1.0, 2.0])
-    return fj.simulate(arm, start, [0, 0.5], (motor, brake)).q[-1, 0]
-
-
-def pulse(end):
-    """Returns the end of a pulse that saturates a controller on both of its sides."""
-    inside = fj.references.Pulse([0.0], [1.0], begin=0.1, end=end)
-    pd = fj.PDController([100.0], [1.0], 10.0, inside)
-    start = fj.State([0.0], [0.0])
-    return fj.simulate(SLIDE, start, [0, 1.0], (pd,)).q[-1, 0]
+    return fj.simulate(arm, start, [0, 0.5], forces).q[-1, 0]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("end", [blow, stopped, pulse])
+@pytest.mark.parametrize("end", [
+    lambda begin: place(*blow(begin), speed=1.0), stopped,
+    lambda end: place(pulse(end), end=1.0),
+], ids=["blow", "brake", "pulse"])  # fmt: skip
 def test_what_a_blow_or_a_pulse_saturates_has_derivatives(end):
     h, both = 1e-4, jax.jit(jax.value_and_grad(end))
     value = lambda begin: both(begin)[0]

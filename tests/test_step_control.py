@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix
 import pytest
+from elements import BAR, SLIDE
 from modes import LOOPS
 
 import fdof_jax as fj
@@ -14,8 +15,6 @@ from fdof_jax.forces import HardStops
 from fdof_jax.steps.tolerances import EagerController, by_square_roots
 
 TS = np.linspace(0, 1, 5)
-# One link, whose programs compile faster.
-ROD = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[1 / 12])
 SWUNG = fj.State([-0.5], [0])
 
 
@@ -41,7 +40,7 @@ def test_steps_as_long_as_the_distance_of_jumps_do_not_fall_short_of_them():
     ts = np.linspace(0, 1, 101)
     forces = (fj.forces.EffortHistory(ts, np.zeros((101, 1))),)
     steps = diffrax.PIDController(rtol=1e-6, atol=1e-6, dtmax=0.01)
-    motion = fj.simulate(ROD, SWUNG, TS, forces, dt0=0.01, stepsize_controller=steps)
+    motion = fj.simulate(BAR, SWUNG, TS, forces, dt0=0.01, stepsize_controller=steps)
     assert motion.stats["num_steps"] <= 102
 
 
@@ -59,7 +58,7 @@ def test_a_norm_of_the_user_s_own_judges_errors():
     counts = []
     for tolerance, norm in ((1e-9, {}), (1e-7, dict(norm=strict)), (1e-7, {})):
         steps = diffrax.PIDController(rtol=tolerance, atol=tolerance, **norm)
-        motion = fj.simulate(ROD, SWUNG, TS, forces, stepsize_controller=steps)
+        motion = fj.simulate(BAR, SWUNG, TS, forces, stepsize_controller=steps)
         counts.append(int(motion.stats["num_steps"]))
     assert counts[0] == counts[1] > counts[2]
 
@@ -67,13 +66,12 @@ def test_a_norm_of_the_user_s_own_judges_errors():
 @pytest.mark.slow
 def test_derivatives_through_a_bounce_under_a_norm_of_one_s_own():
     own = diffrax.PIDController(rtol=1e-8, atol=1e-8, norm=strict)
-    ball = fj.Linkage("P", length=[0, 1], com=[[0, 0]], mass=[1], inertia=[1])
+    ball = SLIDE.replace(gravity=9.81)
     floor = (HardStops(0.0, np.inf, restitution=0.5),)
 
     def end(height):
-        start = fj.State(height[None], jnp.zeros(1))
-        steps = dict(stepsize_controller=own)
-        return fj.simulate(ball, start, [0, 0.6], floor, **steps).q[-1, 0]
+        scene = ball, fj.State(height[None], jnp.zeros(1)), [0, 0.6], floor
+        return fj.simulate(*scene, stepsize_controller=own).q[-1, 0]
 
     def exactly(height):
         fall = jnp.sqrt(2 * height / 9.81)
@@ -128,6 +126,6 @@ def test_few_steps_are_rejected_at_any_tolerance():
 
 @pytest.mark.parametrize("name", ["rtol", "atol"])
 def test_derivatives_with_respect_to_a_tolerance(name):
-    last = lambda x: fj.simulate(ROD, SWUNG, [0, 1.0], **{name: x}).q[-1, 0]
+    last = lambda x: fj.simulate(BAR, SWUNG, [0, 1.0], **{name: x}).q[-1, 0]
     with pytest.raises(RuntimeError, match=name):
         jax.eval_shape(jax.grad(last), 1e-6)

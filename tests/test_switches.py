@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from elements import FORWARD, SLIDE
 from helpers import Push
 from modes import ADJOINT, LOOPS, hessian, jacobian
 from switching_scenes import ELEMENTS, random_members, random_scene
@@ -15,12 +16,6 @@ import fdof_jax as fj
 from fdof_jax.forces import switch
 from fdof_jax.steps.looped_dopri8 import LoopedDopri8
 from fdof_jax.steps.zeros import CHECKS, SHARES, passage
-
-FORWARD = diffrax.ForwardMode()
-SLIDE = fj.Linkage(
-    "P", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[0.1], gravity=0
-)
-
 
 # Where steps end
 
@@ -39,9 +34,8 @@ def test_zeros_of_cubic_polynomials():
     rows = np.stack([p(shares) for p in polynomials], axis=1)[..., None]
     rows, checks = rows[: len(SHARES)], rows[len(SHARES) :]
     no, none, near = jnp.array([False]), jnp.zeros(1), jnp.array(1e-9)
-    found = jax.jit(
-        jax.vmap(lambda a, b: passage(a, b, none + 1, no, none, near, no[0]), in_axes=1)
-    )
+    at = lambda a, b: passage(a, b, none + 1, no, none, near, no[0])
+    found = jax.jit(jax.vmap(at, in_axes=1))
     first, crossed, _, hidden, switched, *_ = found(rows, checks)
     assert (hidden == 1).all()  # cubic polynomials are known exactly
     seen = 0
@@ -150,15 +144,12 @@ def test_switches_of_a_plain_function_are_located(options):
 
 def test_kinks_of_high_gains_are_exact_in_derivatives():
     """A slide under a limited controller of 1e7 N/m for each kg switches five times."""
-    slide = SLIDE.replace(mass=[0.1])
-    reference = lambda t, linkage: (jnp.ones(1), jnp.zeros(1))
+    slide, reference = SLIDE.replace(mass=[0.1]), fj.references.SetPoint([1.0])
 
     def end(speed, damping, tolerance):
         controller = fj.PDController(1e6, damping, 5.0, reference)
-        motion = fj.simulate(
-            slide, fj.State([0.9], jnp.stack([speed])), [0, 0.35], (controller,),
-            rtol=tolerance, atol=tolerance,
-        )  # fmt: skip
+        scene = slide, fj.State([0.9], jnp.stack([speed])), [0, 0.35], (controller,)
+        motion = fj.simulate(*scene, rtol=tolerance, atol=tolerance)
         return motion.q[-1, 0] + 0.1 * motion.qd[-1, 0], motion.stats["num_switches"]
 
     both = jax.jit(jax.value_and_grad(end, has_aux=True), **LOOPS)
@@ -176,11 +167,9 @@ def test_gradients_of_random_motions_equal_differences():
     """In a size of the element, a mass and the start, in one direction."""
 
     def end(x, tolerance, member):
-        arm, start, forces, t1 = random_scene(x, x, 0.1 * (x - 1), member)
-        found = fj.simulate(
-            arm, start, jnp.array([0, t1]), forces, rtol=tolerance, atol=tolerance,
-            adjoint=FORWARD, throw=False,
-        )  # fmt: skip
+        scene = random_scene(x, x, 0.1 * (x - 1), member)
+        options = dict(rtol=tolerance, atol=tolerance, throw=False) | FORWARD
+        found = fj.simulate(scene, jnp.array([0, scene.t1]), **options)
         return found.q[-1], found.stats["num_switches"]
 
     members = jax.tree.map(lambda row: row[::3], random_members())
@@ -189,9 +178,11 @@ def test_gradients_of_random_motions_equal_differences():
     def slopes(x, tolerance):
         # One element after the other, as the steps that they need differ.
         each = len(members[0]) // len(ELEMENTS)
-        of_one = lambda member: jax.jvp(
-            partial(end, tolerance=tolerance, member=member), (x,), (1.0,), has_aux=True
-        )
+
+        def of_one(member):
+            moved = partial(end, tolerance=tolerance, member=member)
+            return jax.jvp(moved, (x,), (1.0,), has_aux=True)
+
         return jax.lax.map(of_one, members, batch_size=each)
 
     def differences(h):
@@ -219,7 +210,7 @@ def test_gradients_of_random_motions_equal_differences():
 @jacobian
 def slopes_in_times(x):
     start, pushes = fj.State([0.0], [0.3]), (Push(x[2], 3.0), Push(x[3], -5.0))
-    found = fj.simulate(SLIDE, start, x[:2], pushes, adjoint=FORWARD)
+    found = fj.simulate(SLIDE, start, x[:2], pushes, **FORWARD)
     return found.q[-1, 0], found.qd[-1, 0], found.stats["num_rejected_steps"]
 
 
@@ -267,15 +258,14 @@ def both_ways(start, places):
     """Derivatives of the last position in the places, by both integrations."""
     ts, state = jnp.array([0.0, 0.8]), fj.State(jnp.array([start]), jnp.array([2.0]))
 
+    scene_at = lambda places: fj.Scene(SLIDE, state, (Marks(places),), 0.8)
+
     def end(places):
-        found = fj.simulate(SLIDE, state, ts, (Marks(places),), adjoint=FORWARD)
+        found = fj.simulate(scene_at(places), ts, **FORWARD)
         return found.q[-1, 0], found.stats
 
-    varied = fj.simulation.sensitivities(
-        lambda places: fj.Scene(SLIDE, state, (Marks(places),), 0.8),
-        lambda scene, solution: solution.q[-1],
-        places, ts, 1e-9,
-    )  # fmt: skip
+    last = lambda scene, solution: solution.q[-1]
+    varied = fj.simulation.sensitivities(scene_at, last, places, ts, 1e-9)
     slope, stats = jax.jacfwd(end, has_aux=True)(places)
     return slope, varied.jacobian[0], stats["one_sided"]
 
@@ -330,7 +320,7 @@ def slopes_of_sliders():
 
     def end(x):
         start, forces = fj.State(x[:2], x[2:4]), (Springless(x[4]),)
-        found = fj.simulate(SLIDERS, start, [0, END], forces, adjoint=FORWARD)
+        found = fj.simulate(SLIDERS, start, [0, END], forces, **FORWARD)
         return jnp.concatenate([found.q[-1], found.qd[-1]])
 
     return hessian(end), hessian(where_sliders_end)

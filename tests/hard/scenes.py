@@ -20,10 +20,8 @@ from modes import jacobian
 import fdof_jax as fj
 
 # Made by benchmarks/make_reference.py and make_driven_reference.py.
-REFERENCE, DRIVEN = (
-    json.loads((Path(__file__).parent / name).read_text())
-    for name in ("reference.json", "driven_reference.json")
-)
+FILES = map(Path(__file__).with_name, ("reference.json", "driven_reference.json"))
+REFERENCE, DRIVEN = (json.loads(path.read_text()) for path in FILES)
 USUAL: dict[str, Any] = dict(
     length=[0, 1, 1, 1], com=[[0.5, 0]] * 3, mass=[1, 1, 1], inertia=[1 / 12] * 3
 )

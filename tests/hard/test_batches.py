@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from elements import BAR
 from modes import LOOPS
 
 import fdof_jax as fj
@@ -64,14 +65,12 @@ def test_members_that_fail_or_take_long_harm_no_other():
 
 def test_a_member_that_starts_nan_adds_nothing_to_a_gradient():
     """A NaN of one member would make the sum over all members NaN."""
-    # Of one link, whose program is the smallest.
-    one = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[0.1])
 
     @partial(jax.jit, **LOOPS)
     @jax.grad
     def slope(mass, q0):
         def end(q0):
-            linkage = eqx.tree_at(lambda a: (a.mass, a.inertia), one, (mass, mass**2))
+            linkage = eqx.tree_at(lambda a: (a.mass, a.inertia), BAR, (mass, mass**2))
             start = fj.State(q0, np.zeros(1))
             motion = fj.simulate(linkage, start, [0, 0.5], throw=False)
             good = motion.result == diffrax.RESULTS.successful

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from elements import BAR, FORWARD
 from modes import LOOPS, jacobian
 
 import fdof_jax as fj
@@ -49,7 +50,7 @@ def _driven(ts, kp, kd, limit, begin, rise, effort):
         stairs = Staircase(begin, rise, jnp.array([1.0, 2.0, 3.0]))
         pd = fj.PDController(kp * jnp.exp(log_kp), kd, limit, stairs)
         forces = pd, Pulse(jnp.array([7.3, 7.3 + 1e-6]), effort)
-        options = dict(stepsize_controller=hard.TIGHT, adjoint=diffrax.ForwardMode())
+        options = dict(stepsize_controller=hard.TIGHT) | FORWARD
         return fj.simulate(arm(), START, ts, forces, **options).q
 
     return jax.jvp(q, (0.0,), (1.0,))
@@ -124,8 +125,7 @@ def stiff(kp, damping, limit, ts):
             fj.PDController(gain, 2 * jnp.sqrt(gain), limit, TARGET),
             fj.JointDamper(factor * damping),
         )
-        options = IMPLICIT | dict(adjoint=diffrax.ForwardMode())
-        solution = fj.simulate(arm(), START, ts, forces, **options)
+        solution = fj.simulate(arm(), START, ts, forces, **IMPLICIT, **FORWARD)
         return (solution.q, solution.qd), solution
 
     _, slopes, solution = jax.jvp(moved, (1.0,), (1.0,), has_aux=True)
@@ -176,11 +176,10 @@ def test_chattering_at_a_limit():
 
 def test_an_implicit_method_does_not_pass_over_what_is_at_rest():
     """It would cross the 10 s in a few steps, with a wrong derivative."""
-    rod = fj.Linkage("R", length=[0, 1], com=[[0.5, 0]], mass=[1], inertia=[1 / 12])
 
     def end(q0):
-        options = dict(solver=diffrax.Kvaerno5(), adjoint=diffrax.ForwardMode())
-        return fj.simulate(rod, fj.State(q0, np.zeros(1)), [0, 10.0], **options).q[-1]
+        options = dict(solver=diffrax.Kvaerno5()) | FORWARD
+        return fj.simulate(BAR, fj.State(q0, np.zeros(1)), [0, 10.0], **options).q[-1]
 
     exact = np.cos(np.sqrt(9.81 * 0.5 / (1 / 3)) * 10)
     assert abs(jacobian(end)(np.array([-np.pi / 2]))[0] - exact) <= 1e-6

@@ -10,13 +10,22 @@ import pytest
 import fdof_jax as fj
 from hard import scenes as hard
 
+TWO_LINKS = fj.scenes.two_link_circle()
 HANGING = np.array([-np.pi / 2, 0, 0])
 REST = hard.free(hard.arm(), HANGING, np.linspace(0, 10, 21), q=HANGING)
 SWING = hard.free(hard.arm(), HANGING + [0.1, 0, 0], np.linspace(0, 1e3, 21))
 
-# A scene, by default that of the files, and its largest error [m or rad]; its largest
-# change of energy, `drift`; its most steps, five times those of heyoka; `lost`, the
-# least relative error of its accelerations by rounding.
+
+def two_link_circle():
+    """The reference is under its efforts; this is under the controller."""
+    scene, (arm, start, forces, _) = hard.load("two-link-circle"), TWO_LINKS
+    np.testing.assert_allclose(start.q, scene.state0.q, atol=1e-15)
+    return scene._replace(linkage=arm, state0=start, forces=forces)
+
+
+# A scene, by default that of the files, and its largest error [m or rad], and `last` at
+# its end; its largest change of energy, `drift`; its most steps, five times those of
+# heyoka; `lost`, the least relative error of its accelerations by rounding.
 MOTIONS = {
     # Without moments of inertia nothing keeps the mass matrix from being singular.
     "fig5": dict(tolerance=1e-10, error=1e-6, drift=1e-8),
@@ -50,6 +59,13 @@ MOTIONS = {
     "at rest": dict(scene=lambda: REST, error=1e-12),
     # Errors of each step add up, and the time itself is rounded.
     "a small swing for 1000 s": dict(scene=lambda: SWING, drift=1e-10),
+    # Chains of two joints at the default tolerance: ten times the errors that were
+    # found. The double pendulum multiplies errors by 5000.
+    "double-pendulum": dict(tolerance=None, error=2e-8),
+    "cart-pole": dict(tolerance=None, error=5e-10, last=3e-11),
+    "two-link circle": dict(
+        scene=two_link_circle, tolerance=None, error=2e-10, last=1e-12
+    ),
 }  # fmt: skip
 
 
@@ -58,9 +74,12 @@ MOTIONS = {
 def test_motions_equal_the_reference(name):
     laws = dict(scene=lambda: hard.load(name), tolerance=1e-12) | MOTIONS[name]
     scene = laws["scene"]()
-    motion = hard.simulate(scene, hard.controller(laws["tolerance"]))
+    tolerance = laws["tolerance"]
+    motion = hard.simulate(scene, tolerance and hard.controller(tolerance))
     if "error" in laws:
         assert hard.error(motion, scene) <= laws["error"]
+    if "last" in laws:
+        assert np.abs(motion.q[-1] - scene.q[-1]).max() <= laws["last"]
     if "drift" in laws:
         assert hard.drift(scene.linkage, motion.q, motion.qd) <= laws["drift"]
     assert motion.stats["num_steps"] <= laws.get("steps", np.inf)
@@ -143,10 +162,8 @@ def test_derivatives_of_a_heavy_tip():
     scene = hard.load("heavy-tip-1e6")._replace(ts=np.linspace(0, 0.1, 21))
 
     def difference(h):
-        moved = lambda h: scene._replace(
-            state0=fj.State(scene.state0.q + h, np.zeros(3))
-        )
-        above, below = (hard.simulate(moved(s)).q[-1] for s in (h, -h))
+        starts = (fj.State(scene.state0.q + s, np.zeros(3)) for s in (h, -h))
+        above, below = (hard.simulate(scene._replace(state0=s)).q[-1] for s in starts)
         return (above - below) / (2 * h)
 
     slope = hard.slopes(scene)[0].sum(axis=1)
@@ -163,14 +180,10 @@ def test_sizes_and_units_do_not_matter(topology):
     usual = motion(hard.arm(topology), hard.START.q, ts)
     unit = np.array([0.0 if joint == "R" else 1.0 for joint in topology])
     for size, mass, gravity in ((1e-3, 1e-3, 9.81), (1e3, 1e9, 9.81), (1e3, 1e3, 9810)):
-        lengths = {key: np.multiply(hard.USUAL[key], size) for key in ("length", "com")}
-        inertia = [mass * size**2 / 12] * 3
-        other = dict(mass=[mass] * 3, inertia=inertia, gravity=gravity)
-        arm, time = (
-            hard.arm(topology, **lengths, **other),
-            (size * 9.81 / gravity) ** 0.5,
-        )
-        found = motion(arm, hard.START.q * size**unit, ts * time)
+        links = {key: np.multiply(hard.USUAL[key], size) for key in ("length", "com")}
+        links |= dict(mass=[mass] * 3, inertia=[mass * size**2 / 12] * 3)
+        arm, time = hard.arm(topology, gravity=gravity, **links), size * 9.81 / gravity
+        found = motion(arm, hard.START.q * size**unit, ts * time**0.5)
         assert np.abs(found.q / size ** unit[None] - usual.q).max() <= 5e-10, size
         steps = found.stats["num_steps"] / usual.stats["num_steps"]
         assert 0.5 < steps < 2, size
@@ -182,10 +195,8 @@ def test_turns_do_not_matter(turns):
     offset = hard.START.q + 2 * np.pi * np.array(turns)
     kept = hard.without_turns(offset)
     ts = np.linspace(0, 5, 11)
-    plain, far = (
-        hard.simulate(hard.free(hard.arm(), q, ts), hard.DEFAULT)
-        for q in (kept, offset)
-    )
+    scenes = (hard.free(hard.arm(), q, ts) for q in (kept, offset))
+    plain, far = (hard.simulate(scene, hard.DEFAULT) for scene in scenes)
     error = np.abs((far.q - offset[None]) - (plain.q - kept[None])).max(axis=0)
     assert (error <= np.maximum(1e-9, np.spacing(np.abs(offset)))).all()
     assert np.abs(far.qd - plain.qd).max() <= 1e-9 * np.abs(plain.qd).max()

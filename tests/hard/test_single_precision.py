@@ -1,12 +1,8 @@
-"""Scene 23: single precision, whose ulp is 1.2e-7, in a process of its own."""
+"""Scene 23: single precision, whose ulp is 1.2e-7."""
 
-import os
 import re
-import subprocess
-import sys
-from pathlib import Path
 
-from helpers import programs
+from test_precision import run
 
 from hard import scenes as hard
 
@@ -50,16 +46,6 @@ for turns in (1e4, 1e6):
 
 def test_a_swing_and_many_turns_in_single_precision():
     """A tolerance below an ulp of the state warns, and does not fight rounding."""
-    tests = Path(__file__).parents[1]
-    environment = os.environ | {"JAX_ENABLE_X64": "0", "PYTHONPATH": str(tests)}
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM],
-        env=environment | programs(),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
-    steps = re.search(r"steps: (\d+)", done.stdout)
+    steps = re.search(r"steps: (\d+)", run(PROGRAM))
     double = hard.simulate(hard.load("swing"), hard.controller(1e-8))
     assert int(steps[1]) <= 2 * double.stats["num_steps"]

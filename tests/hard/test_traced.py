@@ -84,11 +84,8 @@ def test_parameters_that_a_topology_does_not_use(topology):
     assert all(np.isfinite(slope).all() for slope in slopes)
     for name, rows in unused(topology).items():
         for junk in (1e30, np.nan):
-            spoilt = eqx.tree_at(
-                lambda a, name=name: getattr(a, name),
-                linkage,
-                getattr(linkage, name).at[rows].set(junk),
-            )
+            values = getattr(linkage, name).at[rows].set(junk)
+            spoilt = eqx.tree_at(lambda a, of=name: getattr(a, of), linkage, values)
             dirty, _, found = motion_and_slopes(spoilt, START.q, TS)
             if np.isnan(junk) and name in ("com", "inertia"):
                 assert dirty.outcome == "not finite"
@@ -106,9 +103,8 @@ def masked(linkage, x, xd, force):
         xdd = fj.paper.masked_accelerations(changed, x, xd, force)
         return jnp.arange(1.0, 7.0) @ xdd, xdd
 
-    (_, xdd), slopes = jax.value_and_grad(accelerations, (0, 1), has_aux=True)(
-        linkage.mass, x
-    )
+    derive = jax.value_and_grad(accelerations, (0, 1), has_aux=True)
+    (_, xdd), slopes = derive(linkage.mass, x)
     return xdd, *slopes
 
 
