@@ -418,7 +418,7 @@ MUTANTS = {
         "tuning/within_limits.py",
         "jnp.abs(share_now - 1) - _BAND",
         "share_now - 1 - _BAND",
-        "tests/test_limits.py::test_limits_out_of_reach_are_exceeded_least",
+        "tests/tuning/test_limits.py::test_limits_out_of_reach_are_exceeded_least",
     ),
     # Drives, controllers and tuning
     "fixed pairs of a model accelerate": Mutant(
@@ -431,26 +431,26 @@ MUTANTS = {
         "servo/drives.py",
         "right = clip(1 + qd / self.no_load, 0, 1)",
         "right = left",
-        "tests/test_drives.py::test_a_speed_limit_in_four_quadrants",
+        "tests/servo/test_drives.py::test_a_speed_limit_in_four_quadrants",
     ),
     "a lag has no time": Mutant(
         "servo/drives.py",
         "return own, (command - own) / self.time_constant",
         "return command, (command - own) / self.time_constant",
-        "tests/test_drives.py::test_a_lag_is_an_exponential",
+        "tests/servo/test_drives.py::test_a_lag_is_an_exponential",
     ),
     "joints that nothing drives count": Mutant(
         "tuning/losses.py",
         "errors = jnp.where(driven, errors, 0)",
         "pass",
-        "tests/test_limits.py"
+        "tests/tuning/test_limits.py"
         "::test_the_errors_of_a_joint_that_nothing_drives_count_nothing[RR-kd1]",
     ),
     "a search leaves what bounds hold": Mutant(
         "tuning/search.py",
         "((z >= high) & (gradient < 0))",
         "((z >= high) & (gradient > 0))",
-        "tests/test_limits.py"
+        "tests/tuning/test_limits.py"
         "::test_runs_that_fail_that_bounds_hold_and_that_are_flat_end_beside_another",
     ),
     # Instants: elements, references, analyses
@@ -608,7 +608,7 @@ MUTANTS = {
         "servo/signals.py",
         "return q, jnp.where(before | behind, 0, rates)",
         "return q, jnp.where(before, 0, rates)",
-        "tests/test_signals.py::test_ramps_stand_before_and_after_their_times",
+        "tests/servo/test_signals.py::test_ramps_stand_before_and_after_their_times",
     ),
     "no kept step shortens the next": Mutant(
         "steps/tolerances.py",
