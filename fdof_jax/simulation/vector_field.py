@@ -219,7 +219,7 @@ def switching(
     return switches.all_values(args.q0.dtype), tuple(switches.jumping)
 
 
-class Drive(NamedTuple):
+class Forcing(NamedTuple):
     """Causes of motion at a state.
 
     - `delta`, `qd`: displacements and velocities, prescribed ones as they are.
@@ -237,7 +237,7 @@ class Drive(NamedTuple):
     given: Scalars | None
 
 
-def applied(t: Array, y: Integrated, args: Args, schedule: Schedules) -> Drive:
+def applied(t: Array, y: Integrated, args: Args, schedule: Schedules) -> Forcing:
     y, given = followed(y, args, schedule)
     tau, own_rates, switches = efforts(t, y, args, schedule)
     delta, qd, *_ = y
@@ -247,7 +247,7 @@ def applied(t: Array, y: Integrated, args: Args, schedule: Schedules) -> Drive:
     if given is not None:
         m = with_added(added, equations(args.constants, delta, qd))
         tau = minus(tau, times(m.mass, given))
-    return Drive(delta, qd, tau, own_rates, added, switches, given)
+    return Forcing(delta, qd, tau, own_rates, added, switches, given)
 
 
 def _added_at(

@@ -33,7 +33,7 @@ _ON_ZERO = 0.625
 _BRIEF = 10
 
 
-class Switches(NamedTuple):
+class SwitchState(NamedTuple):
     """The state of the switching functions where a step ended.
 
     - `sides` (switch,): those in this step: 1 above and -1 below zero, 0 before the
@@ -43,8 +43,8 @@ class Switches(NamedTuple):
     - `sizes` (switch,): the largest values so far.
     - `early`: whether a function that switches here has not quite reached its zero.
     - `passed`: number of switches so far.
-    - `one_sided`: number of places so far with one-sided derivatives (see `Events`);
-      None if nothing jumps at switches.
+    - `one_sided`: number of places so far with one-sided derivatives, see
+      `EventHandler`; None if nothing jumps at switches.
     - `grazing`, `grazing_here`: how nearly crossings grazed so far, and here; 0 if
       none.
     - `late`: 0, with the derivatives of the time of the event where this step began;
@@ -87,7 +87,7 @@ class Regime(NamedTuple):
     - `changed` (switch,): which functions switched there; `on_zero`: which begin near
       their zeros, as after a switch.
     - `sizes`: their largest values before, 0 of new functions.
-    - `grazing`, `late`: see `Switches`.
+    - `grazing`, `late`: see `SwitchState`.
     """
 
     sides: Array
@@ -99,8 +99,8 @@ class Regime(NamedTuple):
     late: Any  # Array | None
 
 
-class Events(eqx.Module):
-    """Events between the steps of a run.
+class EventHandler(eqx.Module):
+    """Finds where something happens in a step, and does it where the next one begins.
 
     Where efforts jump, derivatives may hold on one side only if a motion starts on a
     switch or meets two at once.
@@ -120,12 +120,12 @@ class Events(eqx.Module):
     ends: tuple[tuple[int, int], ...] = eqx.field(static=True)
     derivatives: bool = eqx.field(static=True)
 
-    def start(self, t0: Array, args: Arguments) -> Switches:
+    def start(self, t0: Array, args: Arguments) -> SwitchState:
         modes = self.term.unknown_modes(args)[0] if self.guards else None
         count, none = len(self.jumping), jnp.zeros_like(t0)
         unknown, no = jnp.zeros(count, t0.dtype), jnp.array(False)
         known = unknown.at[count - self.guards :].set(1)
-        return Switches(
+        return SwitchState(
             sides=known,
             after=known,
             until=t0,
@@ -146,7 +146,7 @@ class Events(eqx.Module):
     # What happens where a step ended?
 
     def crossed(
-        self, t: Array, y: Integrated, args: Arguments, last: Switches, jumped: Truth
+        self, t: Array, y: Integrated, args: Arguments, last: SwitchState, jumped: Truth
     ) -> tuple[Integrated, Regime]:
         """Returns the state where a step begins, and what is in force in it.
 
@@ -177,10 +177,10 @@ class Events(eqx.Module):
         return y, Regime(sides, modes, changed, on_zero, sizes, grazing, late)
 
     def _after_event(
-        self, t: Array, y: Integrated, args: Arguments, last: Switches, sides: Array,
+        self, t: Array, y: Integrated, args: Arguments, last: SwitchState, sides: Array,
         changed: Array, jumped: Truth,
     ) -> tuple[Integrated, PyTree, Array, Array]:  # fmt: skip
-        """Returns state, modes and sides after an event, and `Switches.late`.
+        """Returns state, modes and sides after an event, and `SwitchState.late`.
 
         The state moves on to the time of the event in the modes before, and back in
         those after. Except for resets, this changes nothing but derivatives.
@@ -226,7 +226,7 @@ class Events(eqx.Module):
         return there, modes, sides, late
 
     def _shifted(
-        self, t: Array, y: Integrated, args: Arguments, last: Switches, jumped: Truth
+        self, t: Array, y: Integrated, args: Arguments, last: SwitchState, jumped: Truth
     ) -> Integrated:
         """Returns the state with the derivatives that a switch brings."""
         if not self.derivatives:
@@ -270,8 +270,8 @@ class Events(eqx.Module):
 
     def located(
         self, t0: Array, t1: Array, path: diffrax.AbstractLocalInterpolation,
-        own: Arguments, regime: Regime, last: Switches,
-    ) -> tuple[Found, Switches]:  # fmt: skip
+        own: Arguments, regime: Regime, last: SwitchState,
+    ) -> tuple[Found, SwitchState]:  # fmt: skip
         """Returns what a step found, and the state where it ended."""
         sides, h = regime.sides, t1 - t0
         # Lengths of steps to a switch say nothing about the pace of the motion.
@@ -300,7 +300,7 @@ class Events(eqx.Module):
             switched=jnp.any(after != sides),
             resets=None if resets is None else resets.any(),
         )
-        return constant(found), Switches(
+        return constant(found), SwitchState(
             sides=sides,
             after=after.astype(t0.dtype),
             until=until,
@@ -319,7 +319,7 @@ class Events(eqx.Module):
         )
 
     def _ended(self, passed: Array, after: Array) -> Array | None:
-        """Returns which condition ends the run in a step, see `Switches.ended`.
+        """Returns which condition ends the run in a step, see `SwitchState.ended`.
 
         `passed`: which functions passed a zero on which they had not begun.
         """
@@ -329,7 +329,7 @@ class Events(eqx.Module):
         return jnp.where(ends.any(), jnp.argmax(ends), -1)
 
     def at_end(
-        self, t: Array, y: Integrated, args: Arguments, last: Switches
+        self, t: Array, y: Integrated, args: Arguments, last: SwitchState
     ) -> tuple[Array, Integrated]:
         """Returns time and state at the zero of the condition that ended a run.
 
@@ -347,7 +347,7 @@ class Events(eqx.Module):
         return end + late, moved(late, end, there, args, self.term)
 
     def _one_sided(
-        self, last: Switches, on_zero: Array, regime: Regime, sizes: Array
+        self, last: SwitchState, on_zero: Array, regime: Regime, sizes: Array
     ) -> Array | None:
         if last.one_sided is None:
             return None
@@ -362,7 +362,7 @@ class Events(eqx.Module):
 def events_of(
     term: Term, ts: Array, y0: Integrated, args: Arguments,
     conditions: list[tuple[bool, int]], derivatives: bool,
-) -> Events | None:  # fmt: skip
+) -> EventHandler | None:  # fmt: skip
     """Returns the events of a run over the times `ts`, None if nothing switches.
 
     `conditions`: whether each resets the state (else it ends the run), and its
@@ -380,7 +380,7 @@ def events_of(
         tuple((k, way) for k, (one, way) in zip(places, conditions) if one == resets)
         for resets in (True, False)
     )
-    return Events(term, clearance(ts), jumping, guards, resets, ends, derivatives)
+    return EventHandler(term, clearance(ts), jumping, guards, resets, ends, derivatives)
 
 
 @eqx.filter_jit  # traced once, not at each use in a solve

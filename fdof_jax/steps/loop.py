@@ -17,7 +17,7 @@ from jaxtyping import PyTree
 from ..base.checks import refusal
 from ..base.trees import chosen, constant
 from .dopri8 import DenseOutput
-from .events import Events, Switches
+from .events import EventHandler, SwitchState
 from .judge import Judge, StepEnds, without_nan
 from .landing import NEAR_END, Found, Landing, NextStep
 from .term import Arguments, Integrated, ScheduledTerm
@@ -55,7 +55,7 @@ class Scheme(NamedTuple):
     controller: Controller
     dt0: Array | float | None
     judge: Judge | None
-    events: Events | None
+    events: EventHandler | None
     landing: Landing | None
     adjoint: diffrax.AbstractAdjoint
     most_steps: Any  # int | Array | None
@@ -90,7 +90,7 @@ class Attempt(NamedTuple):
     judged: Any  # JudgeState | PyTree
     wrappers: PyTree
     landing: PyTree
-    switches: Any  # Switches | None
+    switches: Any  # SwitchState | None
     sampled: PyTree
     rows: PyTree
     saved: Array
@@ -116,7 +116,7 @@ class _StepResult(NamedTuple):
     method: PyTree
     failed: diffrax.RESULTS
     found: Found | None
-    switches: Switches | None
+    switches: SwitchState | None
 
 
 class _FixedAnswer(diffrax.AbstractStepSizeController):
