@@ -34,7 +34,7 @@ TESTS = {
     26: ("out of steps", "test_motions.py", "out_of_steps"),
     27: ("junk in unused values", "test_traced.py", "use or fictitious"),
     28: ("losses at zero error", "test_traced.py", "everything"),
-    29: ("Hessians of a batch", "../test_switches.py", "hessians"),
+    29: ("Hessians of a batch", "../test_holding.py", "second_derivatives"),
     30: ("malformed input", "test_malformed.py", ""),
 }
 

@@ -14,6 +14,7 @@ import pytest
 import fdof_jax as fj
 from benchmarks import contestants, page
 from benchmarks.__main__ import load
+from benchmarks.hard_probes import TESTS
 from benchmarks.measure import RECORD, Case, envelope, measure, times_at
 from benchmarks.native import Kernel
 from benchmarks.pendulums import absolute, accelerations, constants, relative
@@ -143,3 +144,10 @@ def test_other_pages_quote_only_what_the_page_shows():
     speeds = numbers(text.split("## How fast")[1].split("\n## ")[0])
     quoted = speeds - {"1e-3", "1e-6", "1e-9"}
     assert len(quoted) >= 6 and quoted <= shown
+
+
+def test_hard_cases_name_tests_that_are_there():
+    for _, file, which in TESTS.values():
+        text = (Path(__file__).parent / "hard" / file).read_text()
+        names = " ".join(re.findall(r"def (test_\w+)", text))
+        assert names and all(word in names for word in which.split(" or "))
