@@ -12,7 +12,6 @@ from test_package import NAMESPACES
 import fdof_jax as fj
 from fdof_jax import analysis
 from fdof_jax.pictures import drawing, plotting
-from fdof_jax.simulation.simulate import check_start
 
 REST = fj.State([0.3], [0.0])
 PD = fj.PDController(9.0, 1.0, np.inf, lambda t, linkage: (jnp.ones(1), jnp.zeros(1)))
@@ -95,11 +94,12 @@ def test_loops_and_limits_of_held_joints_are_refused(element):
         fj.tuning.tune_within(scene, limits, loss=fj.tuning.joint_errors)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("element", HOLDERS[1:], ids=lambda e: type(e).__name__)
 def test_stops_and_brakes_of_prescribed_joints_are_refused(element):
     still = fj.simulation.PrescribedMotion(1, PD.reference)
     with pytest.raises(ValueError, match="a joint whose motion is prescribed"):
-        check_start((still, element), BAR, REST, np.array([0, 1]))  # by `simulate`
+        fj.simulate(BAR, REST, [0, 1], (still, element))
 
 
 def test_a_payload_counts_while_it_is_there():

@@ -51,7 +51,7 @@ class Reference(Part):
             )
 
     def assembly(self, t: Array, linkage: Linkage) -> tuple[Array, Array | float]:
-        raise NotImplementedError  # found at construction
+        raise NotImplementedError  # not reached: a class with neither is refused
 
     def __call__(
         self, t: ArrayLike, linkage: Linkage
