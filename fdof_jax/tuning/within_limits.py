@@ -206,15 +206,15 @@ def _lane(z: Array, problem: tuple[Scene, Loss, Limits, bool]) -> Evaluation:
     scene, loss, limits, with_margins = problem
 
     def residuals(scene, solution):
-        beyond = excess(limits, scene, solution, with_margins)
-        return jnp.concatenate([beyond, residuals_of(loss, scene, solution)])
+        over = excess(limits, scene, solution, with_margins)
+        return jnp.concatenate([over, residuals_of(loss, scene, solution)])
 
     found = gain_jacobian(z, scene, residuals, _TOLERANCE)
     count = scene.linkage.mass.size * (3 * _SPANS + with_margins * _BANDS)
-    beyond, errors = jnp.split(found.residuals, [count])
+    over, errors = jnp.split(found.residuals, [count])
     slopes, jacobian = jnp.split(found.jacobian, [count])
     own = found._replace(residuals=errors, jacobian=jacobian)
-    return sum_of_squares(own, excess=beyond, slopes=slopes)
+    return sum_of_squares(own, excess=over, slopes=slopes)
 
 
 def _search(
@@ -263,8 +263,8 @@ def _search(
         return value, np.append(scale * at(x).gradient[free] / unit, _PRICE)
 
     def room(x: np.ndarray) -> np.ndarray:
-        beyond = np.nan_to_num(at(x).facts["excess"][0], nan=_FAILED)
-        return x[-1] - beyond - _WITHIN
+        over = np.nan_to_num(at(x).facts["excess"][0], nan=_FAILED)
+        return x[-1] - over - _WITHIN
 
     def room_slopes(x: np.ndarray) -> np.ndarray:
         slopes = at(x).facts["slopes"][0][:, free]
