@@ -262,8 +262,11 @@ def test_a_copy_is_equal_or_has_other_numbers():
     assert stiff.replace(one_sided=False, stiffness=2.0).side is None
     for values, words in [
         ({"stiffness": -1}, "^stiffness: expected .* at least 0"),
-        ({"ends": None}, "^ends: expected one of a, b, .*, one_sided, got another"),
-        ({300 * "z": 1}, r"^z{197}\.\.\.: expected one of"),
+        (
+            {"ends": None},
+            r"^ends: expected an argument of SpringDamper \(a, b, .*\), got",
+        ),
+        ({300 * "z": 1}, r"^z{197}\.\.\.: expected an argument"),
     ]:
         with pytest.raises(ValueError, match=words):
             stiff.replace(**values)

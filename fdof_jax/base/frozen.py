@@ -53,8 +53,8 @@ class Frozen(eqx.Module):
         now = self.arguments()
         for name in values:
             if name not in now:
-                names = ", ".join(now)
                 raise ValueError(
-                    f"{plain(name)}: expected one of {names}, got another name."
+                    f"{plain(name)}: expected an argument of {type(self).__name__} "
+                    f"({', '.join(now)}), got another name."
                 )
         return type(self)(**now | values)

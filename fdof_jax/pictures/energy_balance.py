@@ -30,7 +30,8 @@ def energy_balance(
     kinetic, potential = map(np.asarray, jax.vmap(energies)(ts, q, qd))
     potential = potential - potential.min()
 
-    efforts = np.nan_to_num(efforts[:, : len(ts)])  # NaN: a command ends a motion
+    # The command that ended a motion may be NaN.
+    efforts = np.nan_to_num(efforts[:, : len(ts)])
     between = (efforts[:, 1:] + efforts[:, :-1]) / 2
     between[:controls] = efforts[:controls, :-1]
     works = np.sum(between * np.diff(q, axis=0), axis=2)

@@ -27,7 +27,7 @@ class Efforts(NamedTuple):
 
     - `total`: the sum of `elements` (time, n).
     - `elements`: those of each element (element, time, n), also to hold joints or to
-      prescribe their motion, but without weights of added masses.
+      prescribe their motion. Added masses have none, neither weight nor inertia.
     """
 
     total: Float[Array, "time joint"]

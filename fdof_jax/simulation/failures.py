@@ -212,8 +212,8 @@ def check_arguments(forces: tuple[Element, ...]) -> None:
     """Raises TypeError for a plain function with other arguments than an element's."""
     for k, element in enumerate(forces):
         place = "until" if isinstance(element, Until) else f"forces[{k}]"
-        functions = {"": element}
-        if isinstance(element, Until | Reset):
+        functions = {"": element.condition if isinstance(element, Until) else element}
+        if isinstance(element, Reset):
             functions = {f".{name}": e for name, e in vars(element).items()}
         for name, one in functions.items():
             if not (isinstance(one, ForeignElement) and inspect.isfunction(one.called)):

@@ -167,7 +167,7 @@ def _scheme(
         events=events,
         landing=landing,
         adjoint=keywords["adjoint"],
-        most_steps=keywords["max_steps"],
+        max_steps=keywords["max_steps"],
         meter=keywords["progress_meter"],
         lanes=keywords.get("lanes"),  # of sweeps
     )

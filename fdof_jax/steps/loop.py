@@ -24,9 +24,9 @@ from .term import Arguments, Integrated, ScheduledTerm
 from .tolerances import Controller, EagerController, with_error_control
 
 RESULTS: Any = diffrax.RESULTS
-# A lane stops once it has taken `_SLACK` times as many steps as it had taken when
-# `_MOST` of the lanes were done.
-_SLACK, _MOST = 1.5, 7 / 8
+# A lane gives up once it has taken `_SLACK` times as many steps as it had taken when
+# the majority of lanes were done.
+_SLACK, _MAJORITY = 1.5, 7 / 8
 
 
 class Problem(NamedTuple):
@@ -45,9 +45,9 @@ class Scheme(NamedTuple):
     """The numerical scheme: method, control and ends of steps.
 
     - `dt0`: length of the first step, None for the controller's estimate.
-    - `judge`, `events`: None if the controller judges no errors, as with constant
-      steps, where branches are those of each instant; `events` also if nothing
-      switches. `landing`: None without events and known times.
+    - `judge`: None if the controller judges no errors, as with constant steps. Then
+      `events` is None too: nothing is located, and branches are those of each instant.
+    - `events`: None if nothing switches; `landing`: None without events or known times.
     - `lanes`: the axis of a batch in which a lane gives up when most are long done.
     """
 
@@ -58,7 +58,7 @@ class Scheme(NamedTuple):
     events: EventHandler | None
     landing: Landing | None
     adjoint: diffrax.AbstractAdjoint
-    most_steps: Any  # int | Array | None
+    max_steps: Any  # int | Array | None
     meter: diffrax.AbstractProgressMeter
     lanes: str | None
 
@@ -77,8 +77,8 @@ class Attempt(NamedTuple):
       state of a controller that samples. Each is None without any.
     - `rows`: states at output times, infinite at those to come; `saved`: how many are
       there.
-    - `steps`, `accepted`: numbers of steps tried and kept; `typical`: how many most
-      lanes took.
+    - `steps`, `accepted`: numbers of steps tried and kept; `typical`: how many this
+      lane had tried when the majority were done, 0 before.
     - `result`: the first failure, if any.
     """
 
@@ -136,7 +136,7 @@ class _FixedAnswer(diffrax.AbstractStepSizeController):
 
 def solve(problem: Problem, scheme: Scheme) -> Attempt:
     """Integrates a problem; returns the last state of the loop, with any failure."""
-    ts, landing, most = problem.ts, scheme.landing, scheme.most_steps
+    ts, landing, max_steps = problem.ts, scheme.landing, scheme.max_steps
     last = ts[-1] if landing is None else landing.end_of_run(ts)
     kind, checkpoints = _kind_of(scheme)
     # Times add up with rounding, which might leave a step of an ulp at the end.
@@ -144,22 +144,23 @@ def solve(problem: Problem, scheme: Scheme) -> Attempt:
 
     def advance(a: Attempt) -> Attempt:
         taken = _taken(problem, scheme, a)
-        step, judged, wrappers, of_landing = _planned(problem, scheme, a, taken)
-        saved, rows = _saved(ts, kind, a, taken, step.keep)
-        t = step.t0
-        at_end = step.keep & (step.t1 > near_end)
+        plan, judged, wrappers, of_landing = _planned(problem, scheme, a, taken)
+        saved, rows = _saved(ts, kind, a, taken, plan.keep)
+        t = plan.t0
+        # A step that is tried again keeps the end that it was given.
+        at_end = plan.keep & (plan.t1 > near_end)
         # A method may fail in a step that is too long; only one that is kept counts.
-        result = RESULTS.where(step.keep, taken.failed, RESULTS.successful)
-        result = RESULTS.where(result == RESULTS.successful, step.result, result)
+        result = RESULTS.where(plan.keep, taken.failed, RESULTS.successful)
+        result = RESULTS.where(result == RESULTS.successful, plan.result, result)
         steps, typical = a.steps + 1, a.typical
         if scheme.lanes is not None:
             result, typical = _together(steps, typical, result, scheme.lanes)
-        kept = lambda after, before: chosen(step.keep, after, before)
-        return Attempt(  # what is not `kept` already knows whether the step was
+        kept = lambda after, before: chosen(plan.keep, after, before)
+        return Attempt(  # all else follows from the plan, which says what is kept
             t=t,
-            end=jnp.where(at_end, last, jnp.minimum(step.t1, last)),
-            y=kept(_after_gap(problem.term, scheme, a, taken, step), a.y),
-            jumped=None if a.jumped is None else kept(step.jumped, a.jumped),
+            end=jnp.where(at_end, last, jnp.minimum(plan.t1, last)),
+            y=kept(_after_gap(problem.term, scheme, a, taken, plan), a.y),
+            jumped=None if a.jumped is None else kept(plan.jumped, a.jumped),
             method=kept(taken.method, a.method),
             judged=judged,
             wrappers=wrappers,
@@ -170,7 +171,7 @@ def solve(problem: Problem, scheme: Scheme) -> Attempt:
             saved=saved,
             meter=scheme.meter.step(a.meter, constant((t - ts[0]) / (last - ts[0]))),
             steps=steps,
-            accepted=a.accepted + step.keep,
+            accepted=a.accepted + plan.keep,
             typical=typical,
             result=result,
         )
@@ -182,13 +183,13 @@ def solve(problem: Problem, scheme: Scheme) -> Attempt:
         return goes_on & (a.switches.ended < 0)  # no condition has ended it
 
     final = eqx.internal.while_loop(
-        lambda a: unfinished(a) & (True if most is None else a.steps < most),
+        lambda a: unfinished(a) & (True if max_steps is None else a.steps < max_steps),
         advance,
         _first_attempt(problem, scheme, last),
         kind=kind,
-        # As data `most` may change without a new program; other kinds need it to know
-        # how much memory the backward pass takes.
-        max_steps=None if kind == "lax" else most,
+        # As data it may change without a new program; other kinds need it to know how
+        # much memory the backward pass takes.
+        max_steps=None if kind == "lax" else max_steps,
         # Rows are written once and not read: a backward pass need not store them.
         buffers=lambda a: a.rows,
         checkpoints=checkpoints,
@@ -223,7 +224,7 @@ def _first_attempt(problem: Problem, scheme: Scheme, last: Array) -> Attempt:
         # Up to the tolerance, a motion does not depend on the lengths of its steps.
         run = constant(run)
         end, judged = judge.start(run, y0)
-    if landing is not None:
+    if landing is not None:  # a first step of no length finds what holds at `t0`
         end, of_landing = landing.start(t0, last, end)
     if judge is not None and controller is not judge.controller:
         end, wrappers = _around((end, ()), controller).init(*run)
@@ -239,7 +240,7 @@ def _first_attempt(problem: Problem, scheme: Scheme, last: Array) -> Attempt:
         end=end,
         y=y0,
         jumped=jumped,
-        # Methods begin with zeros, or with a guess.
+        # Zeros or a guess, on which the motion does not depend.
         method=constant(method.init(term, t0, end, y0, args)),
         judged=judged,
         wrappers=wrappers,
@@ -262,18 +263,19 @@ def _taken(problem: Problem, scheme: Scheme, a: Attempt) -> _StepResult:
     method, events = scheme.method, scheme.events
     y0, regime, found, switches = a.y, None, None, None
     jumped: Any = False if a.jumped is None else a.jumped
+    stale = jumped  # whether rates that the method keeps are out of date
     args = args._replace(sampled=a.sampled)
     if events is not None:
         y0, regime = events.crossed(a.t, a.y, args, a.switches, jumped)
         args = args._replace(sides=regime.sides, modes=regime.modes)
     if term.settle is not None:  # by an impact, to velocities that are prescribed
-        y0, jumped = term.settle(a.t, y0, args), True  # rates of before are out of date
+        y0, stale = term.settle(a.t, y0, args), True
     # A controller measures the state after impacts. Its commands change accelerations.
     if term.sample is not None:
         sampled, changed = term.sample(a.t, y0, args)
-        args, jumped = args._replace(sampled=sampled), jumped | changed
+        args, stale = args._replace(sampled=sampled), stale | changed
     y1, error, dense, of_method, failed = method.step(
-        term, a.t, a.end, y0, args, a.method, jumped
+        term, a.t, a.end, y0, args, a.method, stale
     )
     path = method.interpolation_cls(t0=a.t, t1=a.end, **dense)
     if events is not None:
@@ -338,7 +340,7 @@ def _planned_without_errors(
 
 
 def _after_gap(
-    term: ScheduledTerm, scheme: Scheme, a: Attempt, taken: _StepResult, step: NextStep
+    term: ScheduledTerm, scheme: Scheme, a: Attempt, taken: _StepResult, plan: NextStep
 ) -> Integrated:
     """Returns the state where the next step begins, before what happens there.
 
@@ -348,7 +350,7 @@ def _after_gap(
     landing = scheme.landing
     if landing is None or not landing.timed:
         return taken.y1
-    path, gap = taken.path, constant(step.t0 - a.end)
+    path, gap = taken.path, constant(plan.t0 - a.end)
     if isinstance(path, DenseOutput):
         rates = path.rate_at_end
     else:
@@ -368,7 +370,10 @@ def _around(answer: tuple, controller: Controller) -> Controller:
 def _saved(
     ts: Array, kind: Any, a: Attempt, taken: _StepResult, keep: Array
 ) -> tuple[Array, PyTree]:
-    """Returns the number of output times so far, and the states there."""
+    """Returns the number of output times so far, and the states there.
+
+    One in a gap between steps is read from the path of the step after it.
+    """
 
     def waiting(output):
         saved, _ = output
@@ -405,12 +410,12 @@ def _together(
 ) -> tuple[diffrax.RESULTS, Array]:
     """Returns a result that gives up if most other lanes are long done.
 
-    Also returns how many steps most of them took, or 0.
+    Also returns `Attempt.typical`.
     """
     # Once a lane is done its state is frozen, so that its count falls behind.
     done = steps < jax.lax.pmax(steps, lanes)
-    most = jax.lax.pmean(done.astype(float), lanes) >= _MOST
-    typical = jnp.where(most & (typical == 0), steps, typical)
+    majority = jax.lax.pmean(done.astype(float), lanes) >= _MAJORITY
+    typical = jnp.where(majority & (typical == 0), steps, typical)
     behind = (typical > 0) & (steps >= _SLACK * typical)
     gives_up = behind & (result == RESULTS.successful)
     return RESULTS.where(gives_up, RESULTS.max_steps_reached, result), typical
@@ -423,7 +428,7 @@ def _never_jumps(controller: Controller) -> bool:
 
 def _kind_of(scheme: Scheme) -> tuple[Any, int | None]:
     """Returns the kind of equinox's loops for an adjoint, and how many checkpoints."""
-    adjoint, bounded = scheme.adjoint, scheme.most_steps is not None
+    adjoint, bounded = scheme.adjoint, scheme.max_steps is not None
     if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint):
         if bounded or adjoint.checkpoints is not None:
             return "checkpointed", adjoint.checkpoints
