@@ -22,14 +22,14 @@ UNOPTIMIZED = dict(
 )
 
 
-def jacobian(function):
+def jacobian(function, options=LOOPS):
     """Returns a function for the Jacobian in forward mode, and the values.
 
     It takes one direction at a time. `jax.jacfwd` takes all at once, which is traced
     and compiled for half as long again; a second derivative, for twice as long.
     """
 
-    @partial(jax.jit, **UNOPTIMIZED)
+    @partial(jax.jit, **options)
     def along(x, direction, *rest):
         return jax.jvp(lambda x: function(x, *rest), (x,), (direction,))
 

@@ -77,7 +77,7 @@ def test_a_loop_answers_as_closed_forms_say():
         rows = zip((of_step, of_pulse, of_ramp), whole(x))
         return sum(np.squeeze(of(*jax.tree.leaves(part))) for of, part in rows)
 
-    found, q = jacobian(lambda x: places(whole(x), **FORWARD))(numbers)
+    found, q = jacobian(lambda x: places(whole(x), **FORWARD), UNOPTIMIZED)(numbers)
     np.testing.assert_allclose(q, right(numbers), atol=1e-8)
     h = 1e-5
     steps = h * np.eye(numbers.size)
