@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import test_elements
-from elements import ALL, FORWARD, HOLDING, START, arm
+from elements import ALL, BAR, FORWARD, HOLDING, START, arm
 from helpers import programs
-from modes import ADJOINT, LOOPS, jacobian
+from modes import ADJOINT, UNOPTIMIZED, jacobian
 
 import fdof_jax as fj
 
@@ -72,23 +72,27 @@ def test_motions_of_arms_in_single_precision_with_all_kinds_of_elements():
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*double precision")
 def test_motions_and_derivatives_are_those_of_the_same_numbers_in_double_precision():
-    """Derivatives in all modes."""
-    short = cast(ARM, np.float32)
+    """Derivatives in all modes, of a bar on a spring."""
+    short = cast(BAR, np.float32)
+    hook, tip = fj.Point(0, 0.3, -0.4), fj.Point(1, 0.5, 0.2)
+    spring = fj.SpringDamper(hook, tip, stiffness=30.0, damping=2.0, rest_length=0.4)
+    first = jnp.array([0.3])
 
     def end(q, linkage=short, **options):
-        start, spring = fj.State(q, START.qd), (ALL["spring"],)
-        motion = fj.simulate(linkage, start, TS, spring, **options)
+        start = fj.State(q, jnp.array([0.5]))
+        motion = fj.simulate(linkage, start, TS, (spring,), **options)
         return motion.q[-1].sum(), motion
 
     forward = partial(end, **FORWARD)
-    expected, (_, right) = jacobian(partial(forward, linkage=cast(short, np.float64)))(
-        START.q
-    )
-    slopes, (_, found) = jacobian(forward)(START.q)
+    long = partial(forward, linkage=cast(short, np.float64))
+    expected, (_, right) = jacobian(long, UNOPTIMIZED)(first)
+    slopes, (_, found) = jacobian(forward, UNOPTIMIZED)(first)
     assert found.outcome == "successful" and found.q.dtype == np.float64
     np.testing.assert_allclose(found.q, right.q, rtol=0, atol=1e-14)
     modes = end, partial(end, adjoint=ADJOINT)
-    others = [jax.jit(jax.grad(of, has_aux=True), **LOOPS)(START.q)[0] for of in modes]
+    others = [
+        jax.jit(jax.grad(of, has_aux=True), **UNOPTIMIZED)(first)[0] for of in modes
+    ]
     wanted = np.tile(expected[0], (3, 1))
     np.testing.assert_allclose([slopes[0], *others], wanted, atol=1e-9)
 

@@ -49,7 +49,7 @@ def test_the_tip_is_on_the_path(topology, path, timing):
         path = Ellipse(fj.tip_position(arm, np.full(n, 1.5)), [0.02, 0.01])
     for branch in (1.0, -1.0):
         task = fj.TipTask(path, timing, orientation=orientation, branch=branch)
-        for t in (0.05, 0.9, 1.7):
+        for t in jnp.array([0.05, 0.9, 1.7]):  # data of one program
             (q, qd, tip, point), (rate, _, velocity, commanded) = seen(task, arm, t)
             np.testing.assert_allclose(tip, point, atol=1e-12)
             np.testing.assert_allclose(qd, rate, atol=1e-12)
@@ -135,14 +135,15 @@ def test_the_reference_never_jumps_and_counts_its_turns(circle, topology):
 
 
 @jax.jit
-def within_reach(arm, circle, ts):
-    """Returns where it is by a search, and by inverse kinematics."""
+def solved(arm, circle, ts):
+    """Returns where inverse kinematics find the joints."""
 
-    def solved(t):
-        at = circle.tip(t), circle.orientation
-        return jnp.isfinite(fj.inverse_kinematics(arm, *at, branch=circle.branch)).all()
+    def at(t):
+        tip = circle.tip(t), circle.orientation
+        q = fj.inverse_kinematics(arm, *tip, branch=circle.branch)
+        return jnp.isfinite(q).all()
 
-    return fj.references.reachable(arm, circle, ts), jax.vmap(solved)(ts)
+    return jax.vmap(at)(ts)
 
 
 @pytest.mark.slow
@@ -154,10 +155,12 @@ def test_a_circle_is_reachable_where_inverse_kinematics_find_the_joints(topology
         random = np.random.default_rng(seed)
         center, (radius, phase, angle) = random.normal(size=2), random.uniform(size=3)
         circle = fj.CircleTask(center, radius, 2.0, phase, angle, (-1) ** seed)
-        found, within = within_reach(arm, circle, ts)
+        found, within = (
+            fj.references.reachable(arm, circle, ts),
+            solved(arm, circle, ts),
+        )
         np.testing.assert_array_equal(found, within)
         some += within.any() and not within.all()
-    np.testing.assert_array_equal(fj.references.reachable(arm, circle, ts), within)
     assert some or topology.count("P") == 2  # of which none is out of reach
 
 
@@ -206,7 +209,6 @@ def spline_of_many_points():
 
 
 BEHIND, BEYOND = "behind the ground pivot", "within the linkage's reach"
-SHORT_OF_LONG = Travel(1.0, begin=0.7), Ramp(np.array(0.7))
 EDGE = np.nextafter(2.3, 3)  # 2 m beside 0.3 m, in floating point
 MOMENT = Spline([[1, 0], [2.5, 0], [1, 0.1]])  # out of reach for a moment
 
@@ -215,12 +217,11 @@ MOMENT = Spline([[1, 0], [2.5, 0], [1, 0.1]])  # out of reach for a moment
 @pytest.mark.parametrize(
     "path, timing, bad, good, words",
     [
-        (RING, Travel(1.0, profile="harmonic"), [0.4, 0.6], [0, 0.4], BEHIND),
         (RING, Laps(-2.0), [0, 5], [0, 0.2], BEHIND),
         (spline_of_many_points(), Travel(1.0), [0, 1], [0, 0.3], BEHIND),
         # So few samples of a run would leave none or two within the second.
-        *((RING, timing, [0, 3e4], [0, 0.7], BEHIND) for timing in SHORT_OF_LONG),
-        *((MOMENT, timing, [0, 3e4], [0, 0.7], BEYOND) for timing in SHORT_OF_LONG),
+        (RING, Ramp(np.array(0.7)), [0, 3e4], [0, 0.7], BEHIND),
+        (MOMENT, Travel(1.0, begin=0.7), [0, 3e4], [0, 0.7], BEYOND),
         (Line([1, 0], [1, 0.5]), Laps(2.0), [0, 1], None, "closed path for `Laps`"),
         (Line([1, 0], [4, 0]), Travel(2.0), [0, 2], [0, 0.1], BEYOND),
         # The joints' velocities are not finite where they begin at the edge.

@@ -10,7 +10,7 @@ import pytest
 from elements import FORWARD, SLIDE
 from helpers import Push
 from modes import ADJOINT, LOOPS, hessian, jacobian
-from switching_scenes import ELEMENTS, random_members, random_scene
+from switching_scenes import EACH, ELEMENTS, random_members, random_scene
 
 import fdof_jax as fj
 from fdof_jax.forces import switch
@@ -172,7 +172,7 @@ def test_gradients_of_random_motions_equal_differences():
         found = fj.simulate(scene, jnp.array([0, scene.t1]), **options)
         return found.q[-1], found.stats["num_switches"]
 
-    members = jax.tree.map(lambda row: row[::3], random_members())
+    members = jax.tree.map(lambda row: row[::EACH], random_members())
 
     @partial(jax.jit, **LOOPS)
     def slopes(x, tolerance):
