@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from modes import UNOPTIMIZED
+from modes import LOOPS
 
 import fdof_jax as fj
 from fdof_jax.forces import HardStops, JointFriction
@@ -62,7 +62,7 @@ def check_motion(row, name):
         assert motion.events.table["event"].tolist() == row.events
 
 
-@eqx.filter_jit(**UNOPTIMIZED)
+@eqx.filter_jit(**LOOPS)
 @eqx.filter_vmap
 def _changed(scene, change, ts):
     """Returns what is known of motions, and how it changes with the scenes."""

@@ -15,21 +15,16 @@ ADJOINT = diffrax.RecursiveCheckpointAdjoint(checkpoints=1024)
 # Programs of derivatives are long: before JAX 0.11 they are compiled as the library
 # compiles motions and searches, in less time than by the default of `jax.jit`.
 LOOPS = dict(compiler_options=options_of_loops())
-# Without LLVM's optimizations they are compiled in half the time, and run for three
-# times as long. That is less where a program is run only a few times.
-UNOPTIMIZED = dict(
-    compiler_options=options_of_loops() | {"xla_backend_optimization_level": 0}
-)
 
 
-def jacobian(function, options=LOOPS):
+def jacobian(function):
     """Returns a function for the Jacobian in forward mode, and the values.
 
     It takes one direction at a time. `jax.jacfwd` takes all at once, which is traced
     and compiled for half as long again; a second derivative, for twice as long.
     """
 
-    @partial(jax.jit, **options)
+    @partial(jax.jit, **LOOPS)
     def along(x, direction, *rest):
         return jax.jvp(lambda x: function(x, *rest), (x,), (direction,))
 

@@ -11,7 +11,7 @@ import pytest
 from elements import SHORT, Swing
 from held_scenes import LATER, NEVER, Row
 from helpers import random_linkage
-from modes import UNOPTIMIZED
+from modes import LOOPS
 from scipy.integrate import simpson, solve_ivp
 
 import fdof_jax as fj
@@ -180,7 +180,7 @@ def test_gradients_equal_differences():
     linkage = random_linkage("PR", np.random.default_rng(3))
     start, weights = fj.State(jnp.zeros(2), jnp.ones(2)), np.array([1.0, -2.0])
 
-    @partial(jax.jit, **UNOPTIMIZED)
+    @partial(jax.jit, **LOOPS)
     @jax.value_and_grad
     def both(p):
         shake, rate, begin, damping = p

@@ -20,7 +20,7 @@ import pytest
 import test_elements
 from elements import ALL, BAR, FORWARD, HOLDING, START, arm
 from helpers import programs
-from modes import ADJOINT, UNOPTIMIZED, jacobian
+from modes import ADJOINT, LOOPS, jacobian
 
 import fdof_jax as fj
 
@@ -85,14 +85,12 @@ def test_motions_and_derivatives_are_those_of_the_same_numbers_in_double_precisi
 
     forward = partial(end, **FORWARD)
     long = partial(forward, linkage=cast(short, np.float64))
-    expected, (_, right) = jacobian(long, UNOPTIMIZED)(first)
-    slopes, (_, found) = jacobian(forward, UNOPTIMIZED)(first)
+    expected, (_, right) = jacobian(long)(first)
+    slopes, (_, found) = jacobian(forward)(first)
     assert found.outcome == "successful" and found.q.dtype == np.float64
     np.testing.assert_allclose(found.q, right.q, rtol=0, atol=1e-14)
     modes = end, partial(end, adjoint=ADJOINT)
-    others = [
-        jax.jit(jax.grad(of, has_aux=True), **UNOPTIMIZED)(first)[0] for of in modes
-    ]
+    others = [jax.jit(jax.grad(of, has_aux=True), **LOOPS)(first)[0] for of in modes]
     wanted = np.tile(expected[0], (3, 1))
     np.testing.assert_allclose([slopes[0], *others], wanted, atol=1e-9)
 

@@ -9,7 +9,7 @@ import pytest
 from elements import FORWARD, SLIDE
 from helpers import Push
 from jax.flatten_util import ravel_pytree
-from modes import ADJOINT, UNOPTIMIZED, jacobian
+from modes import ADJOINT, LOOPS, jacobian
 
 import fdof_jax as fj
 
@@ -77,7 +77,7 @@ def test_a_loop_answers_as_closed_forms_say():
         rows = zip((of_step, of_pulse, of_ramp), whole(x))
         return sum(np.squeeze(of(*jax.tree.leaves(part))) for of, part in rows)
 
-    found, q = jacobian(lambda x: places(whole(x), **FORWARD), UNOPTIMIZED)(numbers)
+    found, q = jacobian(lambda x: places(whole(x), **FORWARD))(numbers)
     np.testing.assert_allclose(q, right(numbers), atol=1e-8)
     h = 1e-5
     steps = h * np.eye(numbers.size)
@@ -86,7 +86,7 @@ def test_a_loop_answers_as_closed_forms_say():
     # In reverse mode, in several times and places
     last, ramp = ravel_pytree(RAMP)
     of_ramp_alone = lambda x: places((STEP, PULSE, ramp(x)))
-    back = jax.jit(jax.jacrev(of_ramp_alone), **UNOPTIMIZED)(last)
+    back = jax.jit(jax.jacrev(of_ramp_alone), **LOOPS)(last)
     np.testing.assert_allclose(back, found[:, -last.size :], atol=1e-7)
 
 
@@ -142,7 +142,7 @@ def test_the_times_of_jumps_past_a_limit_have_derivatives_beside_the_motion():
     end = lambda z: fj.simulate(scene_at(z), ts).q[-1, 0]
     last = lambda _, motion: motion.q[-1]
     varied = lambda z: fj.simulation.sensitivities(scene_at, last, z, ts)
-    beside = jax.jit(varied, **UNOPTIMIZED)
+    beside = jax.jit(varied, **LOOPS)
     for times in ([0.1, 9.0], [0.2, 9.0], [0.05, 0.1], [0.05, 0.2]):
         z = jnp.array(times)
         slopes = [(end(z + h) - end(z - h)) / 2e-5 for h in 1e-5 * np.eye(2)]
@@ -159,7 +159,7 @@ def forward(begin):
 def test_they_have_them_in_all_modes(first):
     """First derivatives forward and by tangents, and second ones over them."""
     twice = lambda begin: jax.jvp(first, (begin,), (1.0,))
-    both = jax.jit(twice, **UNOPTIMIZED)
+    both = jax.jit(twice, **LOOPS)
     for begin in (0.1, 0.2, 0.3):
         (value, slope), (_, curvature) = both(begin)
         left = 0.5 - begin
@@ -173,7 +173,7 @@ def test_each_of_two_jumps_at_one_time_has_its_own_derivative(order, options):
     """Also where one of them passes a limit at once, whichever is listed first."""
     forces = lambda begins: (Push(begins[0], 3.0), step_at(begins[1]))[::order]
     end = lambda begins: place(*forces(begins), **options)
-    slopes = jax.jit(jax.grad(end), **UNOPTIMIZED)
+    slopes = jax.jit(jax.grad(end), **LOOPS)
     for later in (0.0, 2e-15, 1e-12):  # a few units of rounding, and many
         found = slopes(jnp.array([0.3, 0.3 + later]))
         np.testing.assert_allclose(found, [-3 * 0.2, -10 * 0.2], rtol=1e-9)
@@ -191,7 +191,7 @@ def blow(begin):
     lambda end: place(pulse(end), end=1.0),
 ], ids=["blow", "pulse"])  # fmt: skip
 def test_what_a_blow_or_a_pulse_saturates_has_derivatives(end):
-    h, both = 1e-4, jax.jit(jax.value_and_grad(end), **UNOPTIMIZED)
+    h, both = 1e-4, jax.jit(jax.value_and_grad(end), **LOOPS)
     value = lambda begin: both(begin)[0]
     one, two = (value(0.3 + k * h) - value(0.3 - k * h) for k in (1, 2))
     np.testing.assert_allclose(both(0.3)[1], (8 * one - two) / (12 * h), rtol=1e-6)
