@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from elements import BAR, SLIDE
+from modes import LOOPS
 from scipy.integrate import solve_ivp
 
 import fdof_jax as fj
@@ -18,7 +19,7 @@ PENDULUM = fj.scenes.double_pendulum().linkage
 BATCH = dict(solver=LoopedDopri8(), throw=False)
 
 
-@jax.jit
+@partial(jax.jit, **LOOPS)
 @jax.vmap
 def passing(aside, radius, speed, stiffness, end):
     """A slide that passes a round bumper at 2 m, from 0 m on."""
@@ -63,7 +64,7 @@ def test_no_bumper_is_passed_over():
     assert abs(found.stats["slowest_crossing"][2] / share - 1) < 0.1
 
 
-@jax.jit
+@partial(jax.jit, **LOOPS)
 @partial(jax.vmap, in_axes=(0, 0, 0, 0, None, None, None))
 def meeting(q, qd, place, radius, end, tolerance, max_step):
     """A double pendulum whose tip may meet a peg."""
@@ -79,11 +80,11 @@ def meeting(q, qd, place, radius, end, tolerance, max_step):
 def test_no_peg_is_passed_over():
     """Against steps much shorter than the pegs, which are where tips are at 0.4 s."""
     rng = np.random.default_rng(5)
-    q, qd = rng.uniform(-2, 2, (60, 2)) + [0.5, 0], rng.uniform(-3, 3, (60, 2))
-    radius = np.repeat([0.005, 0.02], 30)
-    free = meeting(q, qd, np.full((60, 2), 9.0), radius, 0.4, 1e-11, 1.2)
+    q, qd = rng.uniform(-2, 2, (24, 2)) + [0.5, 0], rng.uniform(-3, 3, (24, 2))
+    radius = np.repeat([0.005, 0.02], 12)
+    free = meeting(q, qd, np.full((24, 2), 9.0), radius, 0.4, 1e-11, 1.2)
     tips = jax.vmap(partial(fj.tip_position, PENDULUM))(free.q[:, -1])
-    place = tips + rng.uniform(-0.6, 0.6, (60, 2)) * radius[:, None]
+    place = tips + rng.uniform(-0.6, 0.6, (24, 2)) * radius[:, None]
     move = partial(meeting, q, qd, place, radius, 1.2)
     exact = move(1e-11, 0.005 / 40)
     assert (exact.stats["num_steps"] > 1.2 / 0.005 * 40).all()
@@ -105,7 +106,7 @@ class Cogging(fj.Element):
         return fj.forces.switch(wave, self.torque, -self.torque)
 
 
-@jax.jit
+@partial(jax.jit, **LOOPS)
 @jax.vmap
 def turning(waves, rate, torque, speed, end):
     start, ts = fj.State(jnp.zeros(1), speed[None]), jnp.stack([0 * end, end])

@@ -22,7 +22,7 @@ def test_gradients_of_a_motion_equal_differences():
 
     Forward mode is compared with a reference in tests/hard/test_motions.py.
     """
-    topology, n = "PFR", 3
+    topology, n = "FR", 2
     rng = np.random.default_rng(n)
     chain, weights = chains.random_chain(topology, rng), rng.normal(size=(2, n))
     ends = fj.Point(0, 3.0, -2.0), fj.Point(n, 0.3, 0.1)

@@ -44,7 +44,7 @@ def with_losses(part, factor):
     return part.replace(**{name: factor * v for name, v in given if name in LOSSES})
 
 
-@eqx.filter_jit
+@eqx.filter_jit(**LOOPS)
 def balance(linkage, parts, q, qd, tau):
     """Returns powers of the elements, and what the arm and all of them gain."""
     forces = tuple(parts.values())

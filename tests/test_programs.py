@@ -56,8 +56,8 @@ def test_a_program_that_raises_nothing_calls_nothing():
     dict(dt0=None, **FORWARD),
 ])  # fmt: skip
 def test_programs_of_other_steps_call_nothing(options):
-    moved = lambda q: fj.simulate(ARM, fj.State(q, q), TS, throw=False, **options).q
-    text = str(jax.make_jaxpr(moved)(START.q))
+    moved = lambda q: fj.simulate(BAR, fj.State(q, q), TS, throw=False, **options).q
+    text = str(jax.make_jaxpr(moved)(TILTED.q))
     assert "while" in text and "callback" not in text
 
 
@@ -138,7 +138,7 @@ class Fragile(eqx.Module):
 
 
 def broken(strength):
-    return fj.simulate(ARM, START, TS, (Fragile(strength),), **SHORT).q
+    return fj.simulate(BAR, TILTED, TS, (Fragile(strength),), **SHORT).q
 
 
 @pytest.mark.slow

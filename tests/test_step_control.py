@@ -54,11 +54,10 @@ def strict(error):
 def test_a_norm_of_the_user_s_own_judges_errors():
     """Here it makes the tolerances a hundredth of what they are."""
     pid = fj.control.PIDController(9.0, 5.0, 1.0, 4.0, fj.references.SetPoint(0.2))
-    forces = pid, HardStops(-1.7, 0.4, restitution=0.5)
     counts = []
     for tolerance, norm in ((1e-9, {}), (1e-7, dict(norm=strict)), (1e-7, {})):
         steps = diffrax.PIDController(rtol=tolerance, atol=tolerance, **norm)
-        motion = fj.simulate(BAR, SWUNG, TS, forces, stepsize_controller=steps)
+        motion = fj.simulate(BAR, SWUNG, TS, (pid,), stepsize_controller=steps)
         counts.append(int(motion.stats["num_steps"]))
     assert counts[0] == counts[1] > counts[2]
 

@@ -94,13 +94,14 @@ def test_shards_in_any_order(mixed, undisturbed, solved, tmp_path):
 
 # Rows: the files, what takes the place of their bytes, the warning, and how many blocks
 # are solved again. Files that are exchanged take each other's bytes.
-CUT, FLIPPED = lambda data: data[:-1], lambda data: data[:-1] + bytes([data[-1] ^ 1])
+CUT, EMPTY = lambda data: data[:-1], lambda data: b""
+FLIPPED = lambda data: data[:-1] + bytes([data[-1] ^ 1])
 Q0, Q4, FAILED0, FAILED4 = "q/c/0/0/0", "q/c/4/0/0", "failed/c/0", "failed/c/4"
 DAMAGES = [
-    *(([name], change, re.escape(name), blocks)
-      for change in (CUT, FLIPPED, lambda data: b"")
-      for name, blocks in ((Q4, 1), ("outcome/c/2", 1), (FAILED4, 1),
-                           ("qd/zarr.json", 0), ("time/c/0", 0), ("zarr.json", 0))),
+    *(([name], change, re.escape(name), blocks) for name, change, blocks in (
+        (Q4, FLIPPED, 1), ("outcome/c/2", CUT, 1), (FAILED4, EMPTY, 1),
+        ("qd/zarr.json", FLIPPED, 0), ("time/c/0", CUT, 0), ("zarr.json", EMPTY, 0),
+        ("zarr.json", FLIPPED, 0))),
     ([Q4], None, f"block 4, got {Q4} missing;", 1),
     ([FAILED4], None, None, 1),  # as of a block that was not finished
     (["digests/1"], None, "block 1, got digests/1 missing;", 1),

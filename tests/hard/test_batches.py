@@ -19,7 +19,7 @@ NAN_START, NAN_LATER, MASSLESS, FAST, HEAVY = range(5)
 OTHERS = slice(5, None)
 
 
-@jax.jit
+@partial(jax.jit, **LOOPS)
 @partial(jax.vmap, in_axes=(0, 0, 0, 0, None))
 def motions(linkage, q, qd, at, ts):
     forces = (Breaking(at),)

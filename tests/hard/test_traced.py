@@ -20,7 +20,7 @@ from hard.scenes import START, arm
 TS = np.linspace(0, 0.5, 21)
 
 
-@eqx.filter_jit
+@eqx.filter_jit(**LOOPS)
 def motion_and_slopes(linkage, q0, ts):
     """Returns a motion, the sum of q^2 at its end, and that sum's gradient.
 
@@ -94,7 +94,7 @@ def test_parameters_that_a_topology_does_not_use(topology):
                 np.testing.assert_array_equal(a, b, err_msg=f"{name} {junk}")
 
 
-@jax.jit
+@partial(jax.jit, **LOOPS)
 def masked(linkage, x, xd, force):
     """Returns accelerations of the paper's form, and derivatives of a sum of them."""
 

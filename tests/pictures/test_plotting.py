@@ -216,24 +216,23 @@ def test_energy_profile_adds_up():
         np.testing.assert_allclose(total, expected, atol=1e-12)
 
 
-LIFT = make_linkage("PPR")
+LIFT = fj.Linkage(
+    "P", length=[0.3, 1], com=[[0.5, 0.1]], mass=[4], inertia=[0.1], base_angle=0.4
+)
 MASS, DAMPING, STIFFNESS = 4.0, 3.0, 50.0
 
 
 def lifted(effort, end=2.0):
-    """Returns an exact motion: the first slide on a damped stop under an effort.
-
-    The other joints stand still, and all masses move with the slide.
-    """
-    damper = fj.JointDamper([DAMPING, 0, 0])
-    stops = JointStops([0, -np.inf, -np.inf], np.inf, stiffness=STIFFNESS)
+    """Returns an exact motion: the slide on a damped stop under an effort."""
+    stops = JointStops(0, np.inf, stiffness=STIFFNESS)
     rest = (effort - MASS * 9.81 * np.cos(0.4)) / STIFFNESS
     rate = np.roots([MASS, DAMPING, STIFFNESS])[0]
     swing = 0.2 * (1 + 1j * rate.real / rate.imag)  # starts with no speed
-    ts, (q, qd) = np.linspace(0, end, 401), np.zeros((2, 401, 3))
+    ts, (q, qd) = np.linspace(0, end, 401), np.zeros((2, 401, 1))
     q[:, 0] = rest + np.real(swing * np.exp(rate * ts))
     qd[:, 0] = np.real(rate * swing * np.exp(rate * ts))
-    return (damper, stops, fj.JointEffort([effort, 0, 0])), made_up(ts, q, qd)
+    forces = fj.JointDamper(DAMPING), stops, fj.JointEffort([effort])
+    return forces, made_up(ts, q, qd)
 
 
 @pytest.mark.slow

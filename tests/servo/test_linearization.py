@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 from helpers import Hold, random_motion
 from modes import LOOPS
-from test_reactions import ACTUATOR
 
 import fdof_jax as fj
 from fdof_jax.identification.result import inverse_and_null_space
 
 each_topology = pytest.mark.parametrize("topology", fj.TOPOLOGIES)
-STILL = np.zeros(3)
+STILL, PAYLOAD = np.zeros(3), fj.forces.Payload(fj.Point(3, 0.4), 0.4, 0.05)
 ROD = fj.Linkage(
     "RRR", length=[0, 1, 1, 1], com=[[0.5, 0]] * 3, mass=[1] * 3, inertia=[1 / 12] * 3
 )
@@ -76,15 +75,15 @@ def test_a_and_b_are_slopes(topology):
 def test_a_stiff_controller_of_limited_efforts_has_an_equilibrium():
     scene = fj.scenes.fig7()
     controller = scene.forces[0]
-    reference, _ = controller.reference(0.0, scene.linkage)
-    # Compiles faster than a reference that moves.
+    # Where the circle begins; compiles faster than a reference that moves.
+    reference = np.array([np.pi / 2, 2.25, -np.pi / 2])
     controller = eqx.tree_at(lambda c: c.reference, controller, Hold(reference))
     slope, q = rest(scene.linkage, controller, reference)
     efforts = controller(0.0, q, STILL, scene.linkage)
     weight = partial(fj.analysis.holding_efforts, scene.linkage)
     np.testing.assert_allclose(efforts, weight(q), rtol=1e-9)
     # The efforts kp (reference - q) hold the weight, whatever kp is.
-    stiffness = np.diag(controller.kp) + jax.jacfwd(weight)(q)
+    stiffness = np.diag(controller.kp) + slopes(weight, q)
     expected = np.linalg.solve(stiffness, np.diag(reference - q))
     np.testing.assert_allclose(slope, expected, rtol=1e-7, atol=1e-15)
     assert 0.01 < np.abs(q - reference).max() < 0.3
@@ -97,9 +96,9 @@ def test_a_stiff_controller_of_limited_efforts_has_an_equilibrium():
 @each_topology
 def test_equilibria_are_where_the_efforts_hold_the_arm(topology):
     linkage, q, *_ = random_motion(topology, 3)
-    tau = fj.analysis.holding_efforts(linkage, q, (ACTUATOR,))  # and its masses
-    tau = tau + ACTUATOR(0.0, q, STILL, linkage)
-    qdd = fj.forward_dynamics(linkage, q, STILL, tau, (ACTUATOR,))
+    tau = fj.analysis.holding_efforts(linkage, q, (PAYLOAD,))  # and its mass
+    tau = tau + PAYLOAD(0.0, q, STILL, linkage)
+    qdd = fj.forward_dynamics(linkage, q, STILL, tau, (PAYLOAD,))
     np.testing.assert_allclose(qdd, 0, atol=1e-9)
     controller = held(linkage, q, [300.0, 200.0, 100.0], np.ones(3))
     _, found = rest(linkage, controller, q + 0.05)

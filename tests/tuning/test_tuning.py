@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from modes import LOOPS
 
 import fdof_jax as fj
 from fdof_jax import scenes
@@ -43,6 +44,15 @@ def circle(kd=10, limit=(60, 1, 30), t1=2.0, wind=2.0):
     push = Indexed(1, True, jnp.array([1, 2]))
     blow = lambda t, q, qd, linkage: [wind, 0, 0]
     return fj.Scene(ARM, START, (fj.PDController(100, kd, limit, TASK), push, blow), t1)
+
+
+demanded = eqx.filter_jit(demands, **LOOPS)
+
+
+def made_of(q, qd, t1=2.0):
+    """Returns states as a motion; all of them share a program."""
+    ts = jnp.linspace(0, t1, len(q))
+    return fj.Solution(ts, *map(jnp.asarray, (q, qd)), {}, None)
 
 
 def losses_of(scene, gains):
@@ -97,7 +107,8 @@ def test_reports_and_texts_say_what_happened():
     assert "not converged, 1 iterations: stopped after 1 evaluations (max_st" in text
     assert ("at its bound" in text) == result.at_bound.any()
     motion = fj.simulate(scene, np.linspace(0, scene.t1, 1001))
-    demand = np.asarray(eqx.filter_jit(demands)(scene.forces[0], ARM, motion))
+    motion = made_of(motion.q, motion.qd)
+    demand = np.asarray(demanded(scene.forces[0], ARM, motion))
     beyond = np.mean(np.abs(demand) > [10, 1, 5], axis=0)
     assert beyond.any() and beyond[1] == 0
     np.testing.assert_allclose(result.histories[0].saturated[0], beyond, atol=3e-3)
@@ -132,17 +143,17 @@ def test_a_gradient_of_zero_is_not_taken_for_convergence():
 def test_prices_are_those_of_the_documentation():
     """Effort and its rate, relative to the limits, beside the mean squared error."""
     scene, rng = circle(limit=[60, 1, 30]), np.random.default_rng(0)
-    ts, (q, qd) = np.linspace(0, 1, 5), rng.normal(size=(2, 5, 3))
-    motion = fj.Solution(jnp.asarray(ts), *map(jnp.asarray, (q, qd)), {}, None)
-    demand = np.asarray(eqx.filter_jit(demands)(scene.forces[0], ARM, motion))
+    q, qd = rng.normal(size=(2, 1001, 3))
+    motion = made_of(q, qd)
+    demand = np.asarray(demanded(scene.forces[0], ARM, motion))
     relative = np.clip(demand / [60, 1, 30], -1, 1)
     assert (np.abs(relative) == 1).any() and not relative[:, 1].any()
-    rates = np.diff(relative, axis=0) / 0.25
+    rates = np.diff(relative, axis=0) / 0.002
     expected = float(np.sum(tip_errors(scene, motion) ** 2))
     expected += 0.1 * np.mean(np.sum(relative**2, axis=1))
     expected += 1e-4 * np.mean(np.sum(rates**2, axis=1))
     loss = fj.tuning.Tracking(effort=0.1, effort_rate=1e-4)
-    residuals = eqx.filter_jit(loss)(scene, motion)
+    residuals = eqx.filter_jit(loss, **LOOPS)(scene, motion)
     assert float(residuals @ residuals) == pytest.approx(expected, rel=1e-12)
     scalar = lambda scene, motion: 3 * jnp.sum(motion.q**2)  # is the loss itself
     (root,) = residuals_of(scalar, scene, motion)
