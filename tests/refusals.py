@@ -407,6 +407,7 @@ MORE = {
           for name in ("q", "qd") for value in (None, ZERO[:2], ZERO * 1j)),
         *each(r"until: .* got one of shape \(3,", "until", lambda t, q, *_: q),
         ("until: expected jax.numpy", dict(until=lambda t, *_: 1 - bool(t)), TypeError),
+        (r"^until: .* \(t, q, qd, l.* other arg", dict(until=lambda t: t), TypeError),
         ("stepsize_controller: .* a condition that ends the motion",
          dict(until=height, stepsize_controller=FIXED)),
         acting(r"@.when: .* shape \(3,", forces.Reset(lambda t, q, *_: q, RESET.then)),
