@@ -224,7 +224,7 @@ def _first_attempt(problem: Problem, scheme: Scheme, last: Array) -> Attempt:
         # Up to the tolerance, a motion does not depend on the lengths of its steps.
         run = constant(run)
         end, judged = judge.start(run, y0)
-    if landing is not None:  # a first step of no length finds what holds at `t0`
+    if landing is not None:  # of no length, if it must find what holds at `t0`
         end, of_landing = landing.start(t0, last, end)
     if judge is not None and controller is not judge.controller:
         end, wrappers = _around((end, ()), controller).init(*run)
