@@ -90,6 +90,14 @@ def test_what_depends_on_time_alone_is_computed_once_a_step():
         assert count(jax.make_jaxpr(function)(100.0).jaxpr) == 1
 
 
+def test_a_circles_angles_are_computed_once():
+    """XLA on CPU would compute them anew for each number that needs them."""
+    at = jax.jit(lambda circle, t, arm: circle(t, arm))
+    program = at.lower(fj.CircleTask(), 0.1, scenes.fig7().linkage).compile()
+    # The sine's leading coefficient: now, at the start, and for the last link.
+    assert program.as_text().count("1.5918129027234826e-10") == 3
+
+
 def stacked(jaxpr, inside=False):
     """Returns whether the loops of a program stack or concatenate arrays."""
     for equation in jaxpr.eqns:

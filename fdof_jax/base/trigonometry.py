@@ -3,12 +3,16 @@
 Polynomials fuse into loops, unlike calls of the scalar C library.
 """
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
+
+from .one_loop import one_loop_on_cpu
 
 # pi/2 as three parts with trailing zeros, whose products with a quadrant number
 # below 2**20 (float64) or 2**10 (float32) are exact, and a remainder.
@@ -124,27 +128,44 @@ def _polynomial_sincos(x: Array) -> tuple[Array, Array]:
     return with_sign(sin, quadrant & 2), with_sign(cos, (quadrant + 1) & 2)
 
 
-@jax.custom_jvp
-def _sincos(x: Array) -> tuple[Array, Array]:
-    return jax.lax.platform_dependent(
-        x, cpu=_polynomial_sincos, default=lambda x: (jnp.sin(x), jnp.cos(x))
-    )
+def _with_derivatives(on_cpu: Callable) -> Callable:
+    """Returns a function for the sine and cosine, which `on_cpu` computes on CPU."""
+
+    @jax.custom_jvp
+    def both(x: Array) -> tuple[Array, Array]:
+        return jax.lax.platform_dependent(
+            x, cpu=on_cpu, default=lambda x: (jnp.sin(x), jnp.cos(x))
+        )
+
+    @both.defjvp
+    def rule(primals, tangents):
+        (x,), (x_dot,) = primals, tangents
+        sin, cos = both(x)
+        return (sin, cos), (cos * x_dot, -sin * x_dot)
+
+    return both
 
 
-@_sincos.defjvp
-def _sincos_jvp(primals, tangents):
-    (x,), (x_dot,) = primals, tangents
-    sin, cos = _sincos(x)
-    return (sin, cos), (cos * x_dot, -sin * x_dot)
+# XLA would compute the polynomials anew in each loop that uses them: ten times for a
+# circle's inverse kinematics.
+_once = _with_derivatives(lambda x: one_loop_on_cpu(_polynomial_sincos(x)))
+_inlined = _with_derivatives(_polynomial_sincos)
 
 
-def sincos(x: ArrayLike) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+def sincos(
+    x: ArrayLike, inlined: bool = False
+) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """Computes the sine and cosine of `x` [rad], each to 2 ulp, also near their zeros.
 
     This holds for |x| <= 2**20 in float64 and |x| <= 1500 in float32. Beyond, the
     result is that of an angle within one rounding of `x`.
+
+    **Arguments:** `inlined`: whether they become a part of the loop that uses them, for
+    what is `fused` already; else they have a loop of their own.
     """
-    return _sincos(jnp.asarray(x, dtype=jnp.result_type(float, x)))
+    return (_inlined if inlined else _once)(
+        jnp.asarray(x, dtype=jnp.result_type(float, x))
+    )
 
 
 def _polynomial_angle(y: Array, x: Array) -> Array:

@@ -207,8 +207,8 @@ def turns(c: Constants, delta: Scalars) -> Scalars:
 
 def directions(c: Constants, delta: Scalars) -> Directions:
     """Computes the unit vectors along the links, turned by displacements."""
-    turned = zip(c.direction[1:], map(sincos, turns(c, delta)))
-    return tuple(_in_frame(cos, sin, e) for e, (sin, cos) in turned)
+    both = (sincos(angle, inlined=True) for angle in turns(c, delta))
+    return tuple(_in_frame(cos, sin, e) for (sin, cos), e in zip(both, c.direction[1:]))
 
 
 class Equations(NamedTuple):
