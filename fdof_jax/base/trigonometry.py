@@ -160,8 +160,8 @@ def sincos(
     This holds for |x| <= 2**20 in float64 and |x| <= 1500 in float32. Beyond, the
     result is that of an angle within one rounding of `x`.
 
-    **Arguments:** `inlined`: whether they become a part of the loop that uses them, for
-    what is `fused` already; else they have a loop of their own.
+    **Arguments:** `inlined`: whether they become a part of the loop that uses them, if
+    that is one loop already; by default they have a loop of their own.
     """
     return (_inlined if inlined else _once)(
         jnp.asarray(x, dtype=jnp.result_type(float, x))
