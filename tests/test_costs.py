@@ -46,7 +46,7 @@ def test_motions_do_not_pay_for_ends_and_jumps_that_they_lack():
     """Programs are as large as before there were conditions, within 2 operations.
 
     Besides, 36 are of loops for sines and cosines, without which XLA computes those of
-    the circle ten times.
+    the circle 14 times.
     """
     linkage, state0, forces, *_ = scenes.fig7()
     ts = jnp.linspace(0, 1, 12)

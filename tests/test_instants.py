@@ -79,7 +79,7 @@ NAMED = {of.__name__: of for of in FREE | TIMELESS}
 def test_what_an_instant_cannot_know_is_refused(name):
     function = NAMED[name]
     needed = inspect.signature(function).parameters.keys() & ARGUMENTS
-    given = {name: ARGUMENTS[name] for name in needed}
+    given = {key: ARGUMENTS[key] for key in needed}
     place, kind = fj.Point(1, 1.0), fj.forces.Payload
     loads = kind(place, 2.0, begin=0.5), kind(place, 2.0, end=0.5), Leaking(place, 2.0)
     refused = HOLDERS if function in FREE else loads
